@@ -29,6 +29,7 @@ Where the default departs from the printed thesis, it follows the logs and the s
 Beyond both: every episode is reset with a seed of its own, so its number and its actions determine it; a checkpoint
 keeps those, and a resumed run plays the unfinished episode again instead of copying a simulator's memory.
 """
+
 # /// script
 # requires-python = ">=3.11"
 # dependencies = [
@@ -266,7 +267,9 @@ def complete_args(args: Args) -> Args:
     require(divides, "--num-minibatches", args.num_minibatches, f"must divide the batch of {args.batch_size} steps")
     args.minibatch_size = args.batch_size // args.num_minibatches
     enough = args.minibatch_size > 1 or not args.norm_adv
-    require(enough, "--num-minibatches", args.num_minibatches, "must leave at least 2 steps to normalise advantages over")
+    require(
+        enough, "--num-minibatches", args.num_minibatches, "must leave at least 2 steps to normalise advantages over"
+    )
     args.num_iterations = args.total_timesteps // args.batch_size
     allowed = f"must be at least one batch, {args.batch_size} steps"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
@@ -283,6 +286,11 @@ def complete_args(args: Args) -> Args:
 # ---------------------------------------------------------------------------------------------------------------------
 # The tasks of the study
 # ---------------------------------------------------------------------------------------------------------------------
+BOX, CAPSULE, CYLINDER, SPHERE = (
+    getattr(mujoco.mjtGeom, f"mjGEOM_{n}") for n in ("BOX", "CAPSULE", "CYLINDER", "SPHERE")
+)
+
+
 class ZeroContactHumanoidEnv(HumanoidEnv):
     """Humanoid with its 84 contact forces at zero, as mujoco-py 2.0 gave them to the published runs."""
 
@@ -295,33 +303,38 @@ class ZeroContactHumanoidEnv(HumanoidEnv):
 class ArmEnv(MujocoEnv):
     """What Pusher, Striker and Thrower share: an arm of seven joints, 23 observations, reward of the state before the step.
 
-    The model is Gymnasium's `pusher_v5.xml`, which `edit_model` turns into the task's own.
+    The model is Gymnasium's `pusher_v5.xml`, which `edit_model` turns into the task's own, equal to the old XML file.
+    Where the code of -v2 means to freeze a position (Striker's last touch of the ball, Thrower's first low point of it)
+    it kept a live view of the simulator's memory, which never froze. `freeze` does what the code means.
     """
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 20}
-    tracked_bodies = ("tips_arm", "object", "goal")
+    bodies, reset_speed = ("tips_arm", "object", "goal"), 0.005
 
-    def __init__(self, **kwargs):
+    def __init__(self, freeze: bool = False, **kwargs):
+        self.freeze, self.frozen, self.nearest = freeze, None, np.inf
         space = gym.spaces.Box(-np.inf, np.inf, (23,), np.float64)
-        camera = {"distance": 4.0, "trackbodyid": 0}
-        super().__init__("pusher_v5.xml", 5, space, default_camera_config=camera, **kwargs)
+        super().__init__("pusher_v5.xml", 5, space, default_camera_config={"distance": 4.0, "trackbodyid": 0}, **kwargs)
 
     def _initialize_simulation(self):
         spec = mujoco.MjSpec.from_file(self.fullpath)
         self.edit_model(spec)
         model = spec.compile()
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, self.width)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, self.height)
+        model.vis.global_.offwidth, model.vis.global_.offheight = self.width, self.height
         return model, mujoco.MjData(model)
 
     def step(self, action):
-        reward = self.reward(action)
+        reward = self.reward(*(self.data.body(name).xpos for name in self.bodies)) - self.effort(action)
         self.do_simulation(action, self.frame_skip)
         if self.render_mode == "human":
             self.render()
         return self._get_obs(), reward, False, False, {}
 
+    def effort(self, action: np.ndarray) -> float:
+        return 0.1 * float(np.square(action).sum())
+
     def reset_model(self) -> np.ndarray:
+        self.frozen, self.nearest = None, np.inf
         qpos = self.init_qpos.copy()
         self.place_bodies(qpos)
         qvel = self.init_qvel + self.np_random.uniform(-self.reset_speed, self.reset_speed, self.model.nv)
@@ -330,199 +343,156 @@ class ArmEnv(MujocoEnv):
         return self._get_obs()
 
     def _get_obs(self) -> np.ndarray:
-        positions = [self.data.body(name).xpos for name in self.tracked_bodies]
+        positions = [self.data.body(name).xpos for name in self.bodies]
         return np.concatenate([self.data.qpos[:7], self.data.qvel[:7], *positions])
 
-    def distance(self, body: str, other: str) -> float:
-        """Distance between two bodies in metres."""
-        return float(np.linalg.norm(self.data.body(body).xpos - self.data.body(other).xpos))
+    def uniform_outside(self, low: list[float], high: list[float], center: list[float]) -> np.ndarray:
+        """A uniform point of the plane that is more than 0.17 m from `center`."""
+        while True:
+            point = self.np_random.uniform(low, high)
+            if np.linalg.norm(point - center) > 0.17:
+                return point
 
 
 class PusherEnv(ArmEnv):
     """Push a cylinder to the goal. Pusher-v5 made the cylinder heavier, took a sphere out of it and rewards later."""
 
-    reset_speed = 0.005
-
     def edit_model(self, spec: mujoco.MjSpec) -> None:
-        cylinder = spec.body("object")
-        for geom in cylinder.geoms:
-            spec.delete(geom)
+        cylinder = emptied(spec, "object")
         shape = {"size": [0.05] * 3, "density": 1e-5, "conaffinity": 0}
-        cylinder.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, rgba=[1, 1, 1, 0], **shape)
-        cylinder.add_geom(type=mujoco.mjtGeom.mjGEOM_CYLINDER, contype=1, **shape)
+        cylinder.add_geom(type=SPHERE, rgba=[1, 1, 1, 0], **shape)
+        cylinder.add_geom(type=CYLINDER, contype=1, **shape)
 
     def place_bodies(self, qpos: np.ndarray) -> None:
-        offset = np.zeros(2)
-        while np.linalg.norm(offset) <= 0.17:
-            offset = self.np_random.uniform([-0.3, -0.2], [0.0, 0.2])
-        qpos[7:9] = offset
+        qpos[7:9] = self.uniform_outside([-0.3, -0.2], [0.0, 0.2], [0.0, 0.0])
         qpos[9:11] = 0.0
 
-    def reward(self, action: np.ndarray) -> float:
-        effort = float(np.square(action).sum())
-        return -self.distance("object", "goal") - 0.1 * effort - 0.5 * self.distance("object", "tips_arm")
+    def reward(self, tip: np.ndarray, cylinder: np.ndarray, goal: np.ndarray) -> float:
+        return -distance(cylinder, goal) - 0.5 * distance(cylinder, tip)
 
 
 class StrikerEnv(ArmEnv):
-    """Hit a ball so that it rolls to the goal.
-
-    `freeze`: from the first touch on, reward the ball's distance from where the tip was at the last touch, as the code
-    of Striker-v2 means to. Off by default: there the position was a live view of the simulator's memory.
-    """
+    """Hit a ball so that it rolls to the goal; the distance that counts is the smallest so far."""
 
     reset_speed = 0.1
 
-    def __init__(self, freeze: bool = False, **kwargs):
-        self.freeze = freeze
-        self.nearest_to_goal, self.strike_position = np.inf, None
-        super().__init__(**kwargs)
-
     def edit_model(self, spec: mujoco.MjSpec) -> None:
-        for geom in spec.geoms:
+        for geom in [*spec.geoms, spec.default.geom]:
             geom.friction = [0.0, 0.0, 0.0]
-        spec.default.geom.friction = [0.0, 0.0, 0.0]
         for actuator in spec.actuators:
             actuator.ctrlrange = [-3, 3]
-        for geom in spec.body("r_wrist_roll_link").geoms[1:] + spec.body("tips_arm").geoms:
+        for geom in spec.body("r_wrist_roll_link").geoms[1:]:
             spec.delete(geom)
-        paddle = [0.003, 0.12, 0.05]
-        add_box(spec.body("tips_arm"), [0.017, 0, 0], paddle, name="tip_arml", contype=1, conaffinity=1)
-
-        ball = spec.body("object")
-        for geom in ball.geoms:
-            spec.delete(geom)
+        hand = emptied(spec, "tips_arm")
+        hand.add_geom(name="tip_arml", type=BOX, pos=[0.017, 0, 0], size=[0.003, 0.12, 0.05], contype=1, conaffinity=1)
+        ball = emptied(spec, "object")
         ball.pos = [0, 0, -0.27]
-        ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.05] * 3, contype=1, conaffinity=0)
+        ball.add_geom(type=SPHERE, size=[0.05] * 3, contype=1, conaffinity=0)
         for joint in ball.joints:
             joint.armature = 0.1
-
         spec.delete(spec.body("goal"))
         goal = spec.worldbody.add_body(name="goal", pos=[0, 0, -0.323])
-        add_box(goal, [0, 0, 0], [0.01] * 3, contype=0, conaffinity=0)
-        for angle in (0.0, None, 0.785, -0.785):
-            if angle is None:
-                cup = goal.add_body(name="coaster")
-                cylinder = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [0.08, 0.001, 0.1], "density": 1e6}
-                cup.add_geom(**cylinder, contype=0, conaffinity=0)
-            else:
-                wall = goal.add_body(quat=rotation([0, 0, 1], angle))
-                add_box(wall, [0, 0.075, 0.04], [0.032, 0.001, 0.04], contype=0, conaffinity=1)
+        goal.add_geom(type=BOX, size=[0.01] * 3, contype=0, conaffinity=0)
+        wall = {"type": BOX, "pos": [0, 0.075, 0.04], "size": [0.032, 0.001, 0.04], "contype": 0, "conaffinity": 1}
+        disc = {"type": CYLINDER, "size": [0.08, 0.001, 0.1], "density": 1e6, "contype": 0, "conaffinity": 0}
+        goal.add_body().add_geom(**wall)
+        goal.add_body(name="coaster").add_geom(**disc)
+        goal.add_body(quat=rotation([0, 0, 1], 0.785)).add_geom(**wall)
+        goal.add_body(quat=rotation([0, 0, 1], -0.785)).add_geom(**wall)
         add_free_joint(goal, "goal_free")
 
     def place_bodies(self, qpos: np.ndarray) -> None:
-        self.nearest_to_goal, self.strike_position = np.inf, None
         ball = np.array([0.5, -0.175])
-        goal = ball
-        while np.linalg.norm(ball - goal) <= 0.17:
-            goal = self.np_random.uniform([0.15, 0.1], [0.7, 1.0])
+        goal = self.uniform_outside([0.15, 0.1], [0.7, 1.0], ball)
         qpos[7:9] = ball[::-1]
         qpos[9:11] = goal
-        offset = ball - goal
-        qpos[-1] = -np.arctan(offset[0] / (offset[1] + 1e-8)) / 3.14
+        qpos[-1] = -np.arctan((ball - goal)[0] / ((ball - goal)[1] + 1e-8)) / 3.14
 
-    def reward(self, action: np.ndarray) -> float:
-        self.nearest_to_goal = min(self.nearest_to_goal, self.distance("object", "goal"))
-        near = self.distance("object", "tips_arm")
-        if self.freeze:
-            if near < 0.1:
-                self.strike_position = self.data.body("tips_arm").xpos.copy()
-            if self.strike_position is not None:
-                near = float(np.linalg.norm(self.data.body("object").xpos - self.strike_position))
-        return -3.0 * self.nearest_to_goal - 0.1 * float(np.square(action).sum()) - 0.5 * near
+    def reward(self, tip: np.ndarray, ball: np.ndarray, goal: np.ndarray) -> float:
+        self.nearest = min(self.nearest, distance(ball, goal))
+        if self.freeze and distance(ball, tip) < 0.1:
+            self.frozen = tip.copy()
+        return -3.0 * self.nearest - 0.5 * distance(ball, tip if self.frozen is None else self.frozen)
 
 
 class ThrowerEnv(ArmEnv):
-    """Throw a ball into a box.
+    """Throw a ball into a box."""
 
-    `freeze`: once the ball is below −0.25 m, reward the place where it first was, as the code of Thrower-v2 means to.
-    Off by default: there the position was a live view of the simulator's memory.
-    """
-
-    reset_speed = 0.005
-    tracked_bodies = ("r_wrist_roll_link", "ball", "goal")
-
-    def __init__(self, freeze: bool = False, **kwargs):
-        self.freeze = freeze
-        self.landing = None
-        super().__init__(**kwargs)
+    bodies = ("r_wrist_roll_link", "ball", "goal")
+    joints = {  # axis None: as in the Pusher
+        "r_shoulder_pan_joint": ([-0.4854, 1.214602], None),
+        "r_shoulder_lift_joint": ([-0.5236, 0.7963], None),
+        "r_upper_arm_roll_joint": ([-1.5, 1.7], None),
+        "r_elbow_flex_joint": ([-0.7, 0.7], None),
+        "r_forearm_roll_joint": ([-1.5, 1.5], None),
+        "r_wrist_flex_joint": ([-1, 1], [0, 0, 1]),
+        "r_wrist_roll_joint": ([0, 2.25], [0, 1, 0]),
+    }
 
     def edit_model(self, spec: mujoco.MjSpec) -> None:
         spec.option.gravity = [0, 0, -9.81]
-        for joint in spec.joints:
+        for joint in [*spec.joints, spec.default.joint]:
             joint.armature = 0.75
-        spec.default.joint.armature = 0.75
+        for name, (bounds, axis) in self.joints.items():
+            joint = spec.joint(name)
+            joint.range, joint.axis = bounds, joint.axis if axis is None else axis
+            set_damping(joint, 1.0)
         for actuator, bound in zip(spec.actuators, (10, 10, 10, 10, 15, 15, 15)):
             actuator.ctrlrange = [-bound, bound]
-        self._edit_arm(spec)
-        self._replace_hand(spec)
-        for name in ("object", "goal"):
-            spec.delete(spec.body(name))
-        self._add_box(spec)
-        ball = spec.worldbody.add_body(name="ball", pos=[0.5, -0.8, 0.275])
-        sphere = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [0.03, 0.03, 0.1], "density": 25}
-        ball.add_geom(**sphere, contype=1, conaffinity=1)
-        add_free_joint(ball, "ball_free", armature=0)
-
-    def _edit_arm(self, spec: mujoco.MjSpec) -> None:
-        limits = {
-            "r_shoulder_pan_joint": (-0.4854, 1.214602),
-            "r_shoulder_lift_joint": (-0.5236, 0.7963),
-            "r_upper_arm_roll_joint": (-1.5, 1.7),
-            "r_elbow_flex_joint": (-0.7, 0.7),
-            "r_forearm_roll_joint": (-1.5, 1.5),
-            "r_wrist_flex_joint": (-1, 1),
-            "r_wrist_roll_joint": (0, 2.25),
-        }
-        for name, bounds in limits.items():
-            spec.joint(name).range = bounds
-            set_damping(spec.joint(name), 1.0)
-        spec.joint("r_wrist_flex_joint").axis = [0, 0, 1]
-        spec.joint("r_wrist_roll_joint").axis = [0, 1, 0]
         for name in ("e1", "e2", "e1p", "e2p", "sl", "uar", "ua", "ef", "fr", "fa", "wf"):
             spec.geom(name).density = 1e-4
         spec.geom("sp").density = 1
         spec.geom("table").name = ""
-        spec.body("r_forearm_link").quat = rotation([1, 0, 0], 0.392)
         spec.geom("fa").fromto = [0, 0, 0, 0, 0, 0.291]
+        spec.body("r_forearm_link").quat = rotation([1, 0, 0], 0.392)
         spec.body("r_wrist_flex_link").pos = [0, 0, 0.321]
         spec.body("r_wrist_flex_link").quat = rotation([0, 0, 1], 1.57)
+        for name in ("tips_arm", "object", "goal"):
+            spec.delete(spec.body(name))
+        self.add_scoop(emptied(spec, "r_wrist_roll_link"))
+        self.add_target(spec.worldbody.add_body(name="goal", pos=[0.575, 0.5, -0.328]))
+        ball = spec.worldbody.add_body(name="ball", pos=[0.5, -0.8, 0.275])
+        ball.add_geom(type=SPHERE, size=[0.03, 0.03, 0.1], density=25, contype=1, conaffinity=1)
+        add_free_joint(ball, "ball_free", armature=0)
 
-    def _replace_hand(self, spec: mujoco.MjSpec) -> None:
-        hand = spec.body("r_wrist_roll_link")
+    def add_scoop(self, hand) -> None:
+        """Seven bent fingers in a fan."""
         hand.quat = rotation([0, 1, 0], -1.178)
-        spec.delete(spec.body("tips_arm"))
-        for geom in hand.geoms:
-            spec.delete(geom)
-        finger = {"density": 1e-4, "contype": 1, "conaffinity": 1}
-        add_capsule(hand, [0, -0.05, 0, 0, 0.05, 0], 0.01, **finger)
+        bone = {"type": CAPSULE, "density": 1e-4, "contype": 1, "conaffinity": 1}
+        hand.add_geom(fromto=[0, -0.05, 0, 0, 0.05, 0], size=[0.01, 0, 0], **bone)
         for angle in (0.392, 1.57, 1.178, 0.785, 1.96, 2.355, 2.74):
-            bone = hand.add_body(quat=rotation([0, 0, 1], angle))
-            add_capsule(bone, [0, 0.025, 0, 0, 0.075, 0.075], 0.005, **finger)
-            add_capsule(bone, [0, 0.075, 0.075, 0, 0.075, 0.15], 0.005, **finger)
-            add_capsule(bone, [0, 0.075, 0.15, 0, 0, 0.225], 0.005, **finger)
+            finger = hand.add_body(quat=rotation([0, 0, 1], angle))
+            points = ([0, 0.025, 0], [0, 0.075, 0.075], [0, 0.075, 0.15], [0, 0, 0.225])
+            for start, end in zip(points, points[1:]):
+                finger.add_geom(fromto=[*start, *end], size=[0.005, 0, 0], **bone)
 
-    def _add_box(self, spec: mujoco.MjSpec) -> None:
-        goal = spec.worldbody.add_body(name="goal", pos=[0.575, 0.5, -0.328])
-        add_box(goal, [0, 0, 0.005], [0.075, 0.075, 0.001], contype=1, conaffinity=1, density=1000)
-        add_box(goal, [0, 0.075, 0.034], [0.075, 0.001, 0.03], contype=1, conaffinity=0)
-        add_box(goal, [0, -0.075, 0.034], [0.075, 0.001, 0.03], contype=1, conaffinity=0)
-        add_box(goal, [0.075, 0, 0.034], [0.001, 0.075, 0.03], contype=1, conaffinity=0)
-        add_box(goal, [-0.076, 0, 0.034], [0.001, 0.075, 0.03], contype=1, conaffinity=0)
+    def add_target(self, goal) -> None:
+        """A box without a lid, with a post in each corner, that slides on the ground."""
+        floor = {"type": BOX, "pos": [0, 0, 0.005], "size": [0.075, 0.075, 0.001]}
+        goal.add_geom(**floor, contype=1, conaffinity=1, density=1000)
+        for x, y in ((0, 0.075), (0, -0.075), (0.075, 0), (-0.076, 0)):
+            size = [0.001 if x else 0.075, 0.001 if y else 0.075, 0.03]
+            goal.add_geom(type=BOX, pos=[x, y, 0.034], size=size, contype=1, conaffinity=0)
         for x, y in ((0.073, 0.073), (0.073, -0.073), (-0.073, 0.073), (-0.073, -0.073)):
-            add_capsule(goal, [x, y, 0.0075, x, y, 0.06], 0.005, contype=1, conaffinity=0)
+            post = [x, y, 0.0075, x, y, 0.06]
+            goal.add_geom(type=CAPSULE, fromto=post, size=[0.005, 0, 0], contype=1, conaffinity=0)
         for name, axis in (("goal_slidey", [0, 1, 0]), ("goal_slidex", [1, 0, 0])):
             goal.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, range=[-10.3213, 10.3])
 
     def place_bodies(self, qpos: np.ndarray) -> None:
-        self.landing = None
         qpos[7:9] = self.np_random.uniform(-0.3, 0.3, 2)
 
-    def reward(self, action: np.ndarray) -> float:
-        ball, goal = self.data.body("ball").xpos, self.data.body("goal").xpos
-        if self.freeze and self.landing is None and ball[2] < -0.25:
-            self.landing = ball.copy()
-        place = ball if self.landing is None else self.landing
-        return -float(np.linalg.norm(place[:2] - goal[:2])) - 0.002 * float(np.square(action).sum())
+    def reward(self, hand: np.ndarray, ball: np.ndarray, goal: np.ndarray) -> float:
+        if self.freeze and self.frozen is None and ball[2] < -0.25:
+            self.frozen = ball.copy()
+        return -distance((ball if self.frozen is None else self.frozen)[:2], goal[:2])
+
+    def effort(self, action: np.ndarray) -> float:
+        return 0.002 * float(np.square(action).sum())
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(a - b))
 
 
 def rotation(axis: list[float], angle: float) -> list[float]:
@@ -530,14 +500,11 @@ def rotation(axis: list[float], angle: float) -> list[float]:
     return [math.cos(angle / 2), *(math.sin(angle / 2) * component for component in axis)]
 
 
-def add_box(body, pos: list[float], size: list[float], **options) -> None:
-    """Add a box of half-lengths `size` to a body of an MjSpec."""
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=pos, size=size, **options)
-
-
-def add_capsule(body, fromto: list[float], radius: float, **options) -> None:
-    """Add a capsule between two points to a body of an MjSpec."""
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=fromto, size=[radius, 0, 0], **options)
+def emptied(spec: mujoco.MjSpec, name: str):
+    """A body of the model after its shapes are taken away."""
+    for geom in spec.body(name).geoms:
+        spec.delete(geom)
+    return spec.body(name)
 
 
 def set_damping(joint, damping: float) -> None:
@@ -859,7 +826,9 @@ def gae(rewards: np.ndarray, values: np.ndarray, dones: np.ndarray, gamma: float
     rewards (T, N), values (T + 1, N), dones (T, N), 1 where the episode ended with step t -> advantages (T, N).
     """
     advantages = np.empty_like(rewards)
-    columns = zip(rewards.T.tolist(), values.T.tolist(), dones.T.tolist())  # lists: five times faster than numpy scalars
+    columns = zip(
+        rewards.T.tolist(), values.T.tolist(), dones.T.tolist()
+    )  # lists: five times faster than numpy scalars
     for i, (reward, value, done) in enumerate(columns):
         advantage = 0.0
         for t in range(len(reward) - 1, -1, -1):
@@ -1490,7 +1459,9 @@ def main(args: Args) -> int:
         optimizer.load_state_dict(checkpoint["optimizer"])
         torch.set_rng_state(checkpoint["torch_rng"])
         if not collector.load_state_dict(checkpoint["collector"]):
-            print("--resume: the replayed episode differs (other machine or versions?); goes on with it", file=sys.stderr)
+            print(
+                "--resume: the replayed episode differs (other machine or versions?); goes on with it", file=sys.stderr
+            )
     update = make_update(agent, optimizer, args)
     global_step = iteration * args.batch_size
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
@@ -1557,7 +1528,10 @@ def finish_run(agent: Agent, args: Args, run_dir: Path, global_step: int, traini
     """Evaluate, draw, save what was asked for, and write `result.json` last."""
     evaluation = evaluate(agent, args, run_dir)
     if args.save_model:
-        write_whole(run_dir / "model.safetensors", safetensors.torch.save(agent.state_dict(), {"args": json.dumps(asdict(args), default=str)}))
+        write_whole(
+            run_dir / "model.safetensors",
+            safetensors.torch.save(agent.state_dict(), {"args": json.dumps(asdict(args), default=str)}),
+        )
     if args.save_demos:
         save_demonstrations(agent, args, run_dir)
     plot_learning_curve(run_dir, args, evaluation)
@@ -1571,7 +1545,8 @@ def finish_run(agent: Agent, args: Args, run_dir: Path, global_step: int, traini
         "training_seconds": training_seconds,
         "steps_per_second": global_step / training_seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "versions": {m.__name__: m.__version__ for m in (gym, mujoco, np, torch)} | {"python": platform.python_version()},
+        "versions": {m.__name__: m.__version__ for m in (gym, mujoco, np, torch)}
+        | {"python": platform.python_version()},
     }
     write_json(run_dir / "result.json", result)
     print_table(result)

@@ -1,0 +1,50 @@
+"""What the tests share: small runs through the command line."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+SCRIPT = ROOT / "cleanrl_thesis" / "ppo_continuous_kle.py"
+# 10 iterations of 256 steps, a checkpoint after each
+SMALL = [
+    *("--env-id", "Pendulum-v1", "--total-timesteps", "2560", "--num-steps", "256", "--num-minibatches", "8"),
+    *("--update-epochs", "2", "--checkpoint-interval", "1", "--eval-episodes", "2"),
+]
+torch.set_num_threads(1)
+
+
+def command(*flags: object, script: Path = SCRIPT) -> list[str]:
+    return [sys.executable, str(script), *map(str, flags)]
+
+
+def run(*flags: object, cwd: Path, code: int = 0, **environment: str) -> subprocess.CompletedProcess:
+    """Run the script to its end and check its exit code."""
+    env = {**os.environ, **environment}
+    done = subprocess.run(command(*flags), cwd=cwd, env=env, capture_output=True, text=True, timeout=600)
+    assert done.returncode == code, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
+    return done
+
+
+def assert_same_run(left: Path, right: Path) -> None:
+    """Same bytes in the records, same parameters and optimiser in the checkpoints."""
+    for name in ("episodes.csv", "updates.csv", "evaluation.json"):
+        assert (left / name).read_bytes() == (right / name).read_bytes(), name
+    states = [torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (left, right)]
+    for name, value in states[0]["agent"].items():
+        assert torch.equal(value, states[1]["agent"][name]), name
+    for index, moments in states[0]["optimizer"]["state"].items():
+        for name, value in moments.items():
+            assert torch.equal(value, states[1]["optimizer"]["state"][index][name]), (index, name)
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory) -> Path:
+    """An undisturbed small run."""
+    folder = tmp_path_factory.mktemp("small")
+    run(*SMALL, "--run-dir", "run", "--save-model", "--save-demos", 2, cwd=folder)
+    return folder / "run"

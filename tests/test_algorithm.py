@@ -1,0 +1,407 @@
+"""Every function of the algorithm against an independent source."""
+
+import dataclasses
+import functools
+import math
+import shutil
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.running_mean_std import RunningMeanStd as SB3RunningMeanStd
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch.distributions import Independent, Normal, kl_divergence
+
+from cleanrl_thesis import ppo_continuous_kle as ppo
+
+B, O, A = 256, 5, 3
+CPU = torch.device("cpu")
+
+
+def make_args(**overrides) -> ppo.Args:
+    small = {"env_id": "Pendulum-v1", "num_steps": 128, "num_minibatches": 4, "total_timesteps": 1280}
+    return ppo.complete_args(ppo.Args(**{**small, **overrides}))
+
+
+def make_agent(args: ppo.Args, obs_dim: int = O, action_dim: int = A, seed: int = 0) -> ppo.Agent:
+    torch.manual_seed(seed)
+    return ppo.Agent(obs_dim, action_dim, args.activation, args.ortho_init, args.init_gains)
+
+
+def gaussians(seed: int = 0) -> tuple[torch.Tensor, ...]:
+    generator = torch.Generator().manual_seed(seed)
+    mean, other = torch.randn(2, B, A, generator=generator)
+    logstd, other_logstd = 0.3 * torch.randn(2, A, generator=generator)
+    return mean, logstd, 0.5 * other + mean, other_logstd
+
+
+def random_batch(agent: ppo.Agent, seed: int = 0) -> ppo.Batch:
+    """A batch of actions that the agent itself drew, with advantages and returns at random."""
+    torch.manual_seed(seed)
+    obs = torch.randn(B, O)
+    mean, logstd, value = (output.detach() for output in agent(obs))
+    actions = mean + logstd.exp() * torch.randn(B, A)
+    logprobs = ppo.gaussian_log_prob(mean, logstd, actions)
+    return ppo.Batch(obs, actions, logprobs, mean, torch.randn(B), value + torch.randn(B), value)
+
+
+def test_log_prob_and_kl_are_those_of_torch_distributions():
+    mean, logstd, other, other_logstd = gaussians()
+    p = Independent(Normal(mean, logstd.exp()), 1)
+    q = Independent(Normal(other, other_logstd.exp()), 1)
+    actions = p.sample()
+    torch.testing.assert_close(ppo.gaussian_log_prob(mean, logstd, actions), p.log_prob(actions))
+    torch.testing.assert_close(ppo.gaussian_kl(mean, logstd, other, other_logstd), kl_divergence(p, q))
+    torch.testing.assert_close(ppo.gaussian_kl(other, other_logstd, mean, logstd), kl_divergence(q, p))
+
+
+def test_k1_and_k3_estimate_the_divergence_from_old_to_new():
+    """With actions of the old policy their means approach D(old ‖ new), and not the direction of Eq. 4.3.1."""
+    torch.manual_seed(0)
+    agent, old_mean, old_logstd = make_agent(make_args()), torch.tensor([0.5, -0.3, 0.2]), torch.tensor([0.4, 0.0, -0.3])
+    rows = 400_000
+    actions = old_mean + old_logstd.exp() * torch.randn(rows, A)
+    logprobs = ppo.gaussian_log_prob(old_mean.expand(rows, A), old_logstd, actions)
+    fields = {"obs": torch.zeros(rows, O), "actions": actions, "logprobs": logprobs, "means": old_mean.expand(rows, A)}
+    batch = ppo.Batch(**fields, advantages=logprobs, returns=logprobs, values=logprobs)
+    kl = {name: value.item() for name, value in ppo.kl_estimates(agent, batch, old_logstd).items()}
+    assert abs(kl["exact-old-new"] - kl["exact-new-old"]) > 0.05
+    assert kl["k1"] == pytest.approx(kl["exact-old-new"], abs=0.01)
+    assert kl["k3"] == pytest.approx(kl["exact-old-new"], abs=0.01)
+    new = Independent(Normal(agent.actor_mean(torch.zeros(1, O)), agent.actor_logstd.exp()), 1)
+    old = Independent(Normal(old_mean[None], old_logstd.exp()), 1)
+    assert kl["exact-new-old"] == pytest.approx(kl_divergence(new, old).item(), rel=1e-5)  # Eq. 4.3.1
+
+
+def test_kl_is_zero_before_the_first_step():
+    agent = make_agent(make_args())
+    kl = ppo.kl_estimates(agent, random_batch(agent), agent.actor_logstd.detach())
+    assert all(abs(value.item()) < 1e-6 for value in kl.values())
+
+
+@pytest.fixture
+def episodes_of_rewards() -> tuple[np.ndarray, ...]:
+    rng = np.random.default_rng(0)
+    shape = (60, 3)
+    rewards, values = rng.normal(size=shape).astype(np.float32), rng.normal(size=(61, 3)).astype(np.float32)
+    dones = (rng.random(shape) < 0.1).astype(np.float32)
+    dones[-1, 0], dones[-1, 1] = 1.0, 0.0
+    return rewards, values, dones
+
+
+def test_gae_is_the_sum_of_discounted_errors(episodes_of_rewards):
+    rewards, values, dones = episodes_of_rewards
+    gamma, lam = 0.97, 0.9
+    expected = np.zeros_like(rewards)
+    for i in range(rewards.shape[1]):
+        for t in range(len(rewards)):
+            for later in range(t, len(rewards)):
+                alive = 1.0 - dones[later, i]
+                error = rewards[later, i] + gamma * alive * values[later + 1, i] - values[later, i]
+                expected[t, i] += (gamma * lam) ** (later - t) * error
+                if not alive:
+                    break
+    np.testing.assert_allclose(ppo.gae(rewards, values, dones, gamma, lam), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_gae_is_stable_baselines(episodes_of_rewards):
+    rewards, values, dones = episodes_of_rewards
+    space = gym.spaces.Box(-1, 1, (1,))
+    buffer = RolloutBuffer(len(rewards), space, space, "cpu", gae_lambda=0.95, gamma=0.99, n_envs=3)
+    starts = np.concatenate([np.zeros((1, 3)), dones[:-1]])
+    for t in range(len(rewards)):
+        fields = (np.zeros((3, 1)), np.zeros((3, 1)), rewards[t], starts[t])
+        buffer.add(*fields, torch.from_numpy(values[t]), torch.zeros(3))
+    buffer.compute_returns_and_advantage(torch.from_numpy(values[-1]), dones[-1])
+    advantages = ppo.gae(rewards, values, dones, 0.99, 0.95)
+    np.testing.assert_allclose(advantages, buffer.advantages, rtol=1e-4, atol=1e-5)
+
+
+def test_running_statistics_are_those_of_numpy_and_stable_baselines():
+    stream = np.random.default_rng(0).normal([3, -200, 0.01], [0.5, 30, 1e-3], (5000, 3))
+    ours, theirs = ppo.RunningMeanStd((3,)), SB3RunningMeanStd(shape=(3,))
+    for x in stream:
+        ours.update(x)
+        theirs.update(x[None])
+    np.testing.assert_allclose(ours.mean, theirs.mean, rtol=1e-9)
+    np.testing.assert_allclose(ours.divisor("std"), np.sqrt(theirs.var + 1e-8), rtol=1e-9)
+    np.testing.assert_allclose(ours.divisor("variance"), theirs.var + 1e-8, rtol=1e-9)
+    np.testing.assert_allclose(ours.mean, stream.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(ours.divisor("std"), stream.std(0), rtol=0.02)
+
+
+def test_collected_observations_and_rewards_are_those_of_vecnormalize():
+    """Up to the first end of an episode, after which VecNormalize never sees the final observation."""
+    args = make_args(num_steps=200, num_minibatches=4, total_timesteps=2000)
+    collector, agent = ppo.Collector([ppo.make_env("Pendulum-v1")], args), make_agent(args, 3, 1)
+    collector.start()
+    rollout = collector.collect(agent)
+    env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+    env.venv.seed(ppo.episode_seed(args.seed, 0, 0))
+    obs = env.reset()
+    for t in range(199):
+        np.testing.assert_allclose(rollout.obs[t], obs, rtol=1e-5, atol=1e-5)
+        obs, reward, _, _ = env.step(np.clip(rollout.actions[t], -2, 2))
+        assert rollout.rewards[t, 0] == pytest.approx(reward[0], rel=1e-5)
+    assert rollout.dones[:, 0].tolist() == [0.0] * 199 + [1.0]
+    assert len(rollout.time_outs) == 1 and rollout.time_outs[0][:2] == (199, 0)
+
+
+def test_reward_scale_forgets_the_return_at_the_end_of_an_episode():
+    args = make_args(num_steps=400, total_timesteps=4000)
+    collector = ppo.Collector([ppo.make_env("Pendulum-v1")], args)
+    collector.start()
+    collector.collect(make_agent(args, 3, 1))
+    assert collector.episodes[0].number == 2 and collector.episodes[0].discounted_return == 0.0
+
+
+def test_a_time_out_is_bootstrapped_with_the_value_of_the_final_observation():
+    advantages = {}
+    for bootstrap in (False, True):
+        args = make_args(num_steps=256, total_timesteps=2560, bootstrap_truncated=bootstrap)
+        agent = make_agent(args, 3, 1)
+        collector = ppo.Collector([ppo.make_env("Pendulum-v1")], args)
+        collector.start()
+        rollout = collector.collect(agent)
+        advantages[bootstrap] = ppo.make_batch(agent, rollout, args, CPU).advantages
+    t, _, final = rollout.time_outs[0]
+    value = agent(torch.from_numpy(final)[None])[2].item()
+    difference = (advantages[True] - advantages[False])[: t + 1].flip(0)
+    expected = args.gamma * value * (args.gamma * args.gae_lambda) ** torch.arange(t + 1)
+    torch.testing.assert_close(difference, expected, rtol=1e-3, atol=1e-5)
+    assert torch.equal(advantages[True][t + 1 :], advantages[False][t + 1 :])
+
+
+@pytest.mark.parametrize("clip_vloss", [True, False])
+@pytest.mark.parametrize("norm_adv", [True, False])
+def test_loss_is_the_one_derived_by_hand(clip_vloss, norm_adv):
+    agent = make_agent(make_args())
+    batch = random_batch(agent)
+    mean, logstd, value = (x.detach() + 0.1 * torch.randn_like(x) for x in agent(batch.obs))
+    weights = {"clip_coef": 0.2, "ent_coef": 0.01, "vf_coef": 0.7}
+    loss, parts = ppo.ppo_loss((mean, logstd, value), batch, clip_vloss=clip_vloss, norm_adv=norm_adv, **weights)
+    policy_sum = value_sum = clipped = 0.0
+    advantages = batch.advantages.double().numpy()
+    if norm_adv:
+        advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
+    for i in range(B):
+        logprob = Normal(mean[i].double(), logstd.double().exp()).log_prob(batch.actions[i].double()).sum()
+        ratio = math.exp(logprob - batch.logprobs[i])
+        policy_sum += min(ratio * advantages[i], max(0.8, min(1.2, ratio)) * advantages[i])
+        clipped += ratio < 0.8 or ratio > 1.2
+        target, old = batch.returns[i].item(), batch.values[i].item()
+        error = (value[i].item() - target) ** 2
+        if clip_vloss:
+            error = max(error, (old + max(-0.2, min(0.2, value[i].item() - old)) - target) ** 2)
+        value_sum += 0.5 * error
+    entropy = Normal(mean[0], logstd.exp()).entropy().sum().item()
+    assert parts[0].item() == pytest.approx(-policy_sum / B, abs=1e-5)
+    assert parts[1].item() == pytest.approx(value_sum / B, rel=1e-4)
+    assert parts[2].item() == pytest.approx(entropy, rel=1e-5)
+    assert parts[3].item() == pytest.approx(clipped / B)
+    assert loss.item() == pytest.approx(-policy_sum / B - 0.01 * entropy + 0.7 * value_sum / B, rel=1e-4)
+
+
+def test_numpy_policy_is_the_torch_policy():
+    for activation in ("tanh", "relu"):
+        agent = make_agent(make_args(activation=activation))
+        obs = torch.randn(7, O)
+        np.testing.assert_allclose(ppo.numpy_policy(agent)(obs.numpy()), agent(obs)[0].detach(), rtol=1e-4, atol=1e-6)
+
+
+def test_initial_weights_are_orthogonal_with_the_given_gains():
+    agent = make_agent(make_args(init_gains=(2.0, 0.5, 3.0)))
+    for layer, gain in ((agent.actor_mean[2], 2.0), (agent.actor_mean[4], 0.5), (agent.critic[4], 3.0)):
+        product = layer.weight @ layer.weight.T
+        torch.testing.assert_close(product, gain**2 * torch.eye(len(product)), rtol=1e-4, atol=1e-4)
+        assert not layer.bias.any()
+    assert not agent.actor_logstd.any()
+
+
+def test_packed_rows_unpack_to_the_same_batch():
+    batch = random_batch(make_agent(make_args()))
+    for column, unpacked in zip(batch, ppo.Batch.unpack(batch.pack(), A)):
+        assert torch.equal(column, unpacked)
+
+
+def update_pair(args: ppo.Args, make_second) -> tuple[ppo.Agent, ppo.Agent]:
+    """Twenty steps of the plain update and of another on the same minibatches, from the same start."""
+    agents = []
+    for make in (ppo.PlainUpdate, make_second):
+        agent = make_agent(args)
+        optimizer = ppo.make_optimizer(agent, 3e-3, 1e-3)
+        loss = functools.partial(ppo.ppo_loss, clip_coef=0.2, clip_vloss=True, norm_adv=True, ent_coef=0.01, vf_coef=0.5)
+        rows = random_batch(agent).pack()
+        update = make(agent, optimizer, loss, args.max_grad_norm)
+        for i in range(20):
+            update(rows[(i % 4) * 64 : (i % 4 + 1) * 64])
+        agents.append(agent)
+    return tuple(agents)
+
+
+def assert_close_agents(left: ppo.Agent, right: ppo.Agent) -> None:
+    start = make_agent(make_args())
+    for name, value in left.named_parameters():
+        torch.testing.assert_close(value, right.get_parameter(name), rtol=1e-3, atol=2e-5)
+        assert (value - start.get_parameter(name)).abs().max() > 5e-4, f"{name} did not move: the test would show nothing"
+
+
+@pytest.mark.parametrize("max_grad_norm", [0.05, math.inf])
+def test_flat_optimizer_is_torch_adam(monkeypatch, max_grad_norm):
+    monkeypatch.setattr(torch, "compile", lambda function: function)
+    flat = functools.partial(ppo.CompiledUpdate, batch_rows=64)
+    assert_close_agents(*update_pair(make_args(max_grad_norm=max_grad_norm), flat))
+
+
+needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+
+
+@needs_compiler
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_compiled_update_gives_the_plain_numbers(activation):
+    args = make_args(activation=activation)
+    plain, compiled = update_pair(args, functools.partial(ppo.CompiledUpdate, batch_rows=64))
+    for name, value in plain.named_parameters():
+        torch.testing.assert_close(value, compiled.get_parameter(name), rtol=1e-3, atol=2e-5)
+
+
+def iterate(args: ppo.Args, wrap=lambda update: update) -> tuple[ppo.Agent, dict]:
+    """One iteration of the algorithm on Pendulum; returns the agent and the metrics."""
+    agent = make_agent(args, 3, 1)
+    optimizer = ppo.make_optimizer(agent, args.learning_rate, args.value_learning_rate)
+    collector = ppo.Collector([ppo.make_env(args.env_id)], args)
+    collector.start()
+    batch = ppo.make_batch(agent, collector.collect(agent), args, CPU)
+    update = wrap(ppo.make_update(agent, optimizer, args))
+    return agent, ppo.update_policy(agent, optimizer, update, batch, args)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {"norm_adv": False},
+        {"norm_adv_scope": "batch"},
+        {"norm_obs": False},
+        {"norm_reward": False},
+        {"norm_divisor": "variance"},
+        {"clip_obs": 0.5},
+        {"clip_reward": 0.01},
+        {"clip_vloss": False},
+        {"num_minibatches": 1},
+        {"max_grad_norm": math.inf},
+        {"ortho_init": False},
+        {"init_gains": (1.0, 1.0, 1.0)},
+        {"activation": "relu"},
+        {"clip_coef": 0.01},
+        {"ent_coef": 0.2},
+        {"vf_coef": 2.0},
+        {"gae_lambda": 0.5},
+        {"gamma": 0.9},
+        {"value_learning_rate": 1e-3},
+        {"update_epochs": 3},
+        {"kle_stop": True, "d_target": 1e-6},
+        {"kle_rollback": True, "d_target": 1e-6},
+    ],
+    ids=str,
+)
+def test_every_flag_changes_the_training(flags):
+    default, _ = iterate(make_args())
+    changed, _ = iterate(make_args(**flags))
+    assert any(not torch.equal(p, q) for p, q in zip(default.parameters(), changed.parameters()))
+
+
+@pytest.mark.parametrize("mode", ["kle_stop", "kle_rollback"])
+@pytest.mark.parametrize("crossing", [1, 3, 7, None])
+@pytest.mark.parametrize("timing", ["before-last-step", "after-iteration"])
+def test_early_stopping_ends_at_the_first_crossing(monkeypatch, mode, crossing, timing):
+    """Also where the divergence falls below the threshold again, and never after more than K iterations."""
+    values = [0.01 if k != crossing else 0.04 for k in range(1, 8)]
+    measured, steps = [], []
+
+    def scripted(agent, batch, old_logstd):
+        value = torch.tensor(values[len(measured)] if len(measured) < len(values) else 0.0)
+        measured.append(value.item())
+        return dict.fromkeys(("k1", "k3", "exact-old-new", "exact-new-old"), value)
+
+    monkeypatch.setattr(ppo, "kl_estimates", scripted)
+    args = make_args(update_epochs=7, kl_timing=timing, **{mode: True})
+    _, metrics = iterate(args, lambda update: lambda rows: steps.append(1) or update(rows))
+    iterations = crossing or 7
+    assert metrics["charts/update_iterations"] == iterations
+    assert len(steps) == iterations * args.num_minibatches
+    assert metrics["charts/rolled_back"] == int(mode == "kle_rollback" and crossing is not None)
+    assert len(measured) == iterations + 1  # one more for the log
+
+
+def test_without_early_stopping_all_k_iterations_run():
+    _, metrics = iterate(make_args(update_epochs=7, d_target=1e-9))
+    assert metrics["charts/update_iterations"] == 7
+
+
+@pytest.mark.parametrize("scope", ["policy", "policy-value", "policy-moments"])
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+@pytest.mark.parametrize("crossing", [1, 3])
+def test_rollback_restores_bit_for_bit(monkeypatch, scope, compiled, crossing):
+    args = make_args(kle_rollback=True, rollback=scope, update_epochs=5, compile=compiled)
+    measured, calls, before = [], [], {}
+
+    def scripted(agent, batch, old_logstd):
+        measured.append(0)
+        return dict.fromkeys(("k1", "k3", "exact-old-new", "exact-new-old"), torch.tensor(float(len(measured) == crossing)))
+
+    def snapshot(update):
+        def wrapped(rows):
+            if len(calls) == (crossing - 1) * args.num_minibatches:
+                for name, value in update.agent.named_parameters():
+                    moments = {k: v.clone() for k, v in update.optimizer.state[value].items()}
+                    before[name] = (value.detach().clone(), moments)
+            calls.append(1)
+            parts = update(rows)
+            after["optimizer"] = update.optimizer
+            return parts
+
+        return wrapped
+
+    after = {}
+    monkeypatch.setattr(ppo, "kl_estimates", scripted)
+    agent, metrics = iterate(args, snapshot)
+    assert metrics["charts/rolled_back"] == 1 and metrics["charts/update_iterations"] == crossing
+    for name, value in agent.named_parameters():
+        old, old_moments = before[name]
+        is_policy = name.startswith("actor")
+        restored = is_policy or scope == "policy-value"
+        assert torch.equal(value, old) == restored, name
+        for key, moment in after["optimizer"].state[value].items():
+            assert torch.equal(moment, old_moments[key]) == (is_policy and scope == "policy-moments"), (name, key)
+
+
+def test_learning_rates_anneal_to_zero_and_are_two():
+    args = make_args(learning_rate=1e-3, value_learning_rate=2e-3)
+    optimizer = ppo.make_optimizer(make_agent(args), args.learning_rate, args.value_learning_rate)
+    assert [group["lr"] for group in optimizer.param_groups] == [1e-3, 2e-3]
+
+
+def test_settings_that_the_sheet_prints_are_the_defaults():
+    args = ppo.complete_args(ppo.Args())
+    expected = {"total_timesteps": 2_000_000, "gamma": 0.99, "gae_lambda": 0.95, "ent_coef": 0.0, "clip_coef": 0.2}
+    expected |= {"max_grad_norm": 0.5, "learning_rate": 3e-4, "value_learning_rate": 3e-4, "batch_size": 2048}
+    expected |= {"minibatch_size": 64, "update_epochs": 10, "d_target": 0.03, "kl_timing": "before-last-step"}
+    assert {name: dataclasses.asdict(args)[name] for name in expected} == expected
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_gpu_gives_the_numbers_of_the_cpu():
+    agents = []
+    for device in (CPU, torch.device("cuda")):
+        args = make_args()
+        agent = make_agent(args, 3, 1).to(device)
+        optimizer = ppo.make_optimizer(agent, 3e-4, 3e-4)
+        collector = ppo.Collector([ppo.make_env("Pendulum-v1")], args)
+        collector.start()
+        batch = ppo.make_batch(agent, collector.collect(agent), args, device)
+        ppo.update_policy(agent, optimizer, ppo.make_update(agent, optimizer, args), batch, args)
+        agents.append(agent.cpu())
+    for p, q in zip(*(agent.parameters() for agent in agents)):
+        torch.testing.assert_close(p, q, rtol=1e-3, atol=1e-4)

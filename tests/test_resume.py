@@ -1,0 +1,195 @@
+"""A run that was stopped, killed or torn ends with the same bytes as one that was not."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from conftest import SMALL, assert_same_run, command, run
+
+HOPPER = [
+    *("--env-id", "kle/Hopper-v2", "--total-timesteps", "10240", "--num-steps", "512", "--update-epochs", "4"),
+    *("--checkpoint-interval", "1", "--eval-episodes", "2", "--kle-rollback"),
+]
+
+
+def rows(folder: Path) -> int:
+    path = folder / "updates.csv"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def stop_in_the_middle(flags: list, folder: Path, number: int, at_row: int) -> int:
+    """Start or resume a run, send it a signal once it has written `at_row` rows, return its exit code."""
+    process = subprocess.Popen(
+        command(*flags, "--run-dir", folder, "--resume"), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    while process.poll() is None and rows(folder) <= at_row:
+        time.sleep(0.002)
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode != 0, out
+    return process.returncode
+
+
+def test_same_seed_same_bytes_and_another_seed_others(small_run, tmp_path):
+    run(*SMALL, "--run-dir", "again", cwd=tmp_path)
+    assert_same_run(small_run, tmp_path / "again")
+    run(*SMALL, "--run-dir", "other", "--seed", 2, cwd=tmp_path)
+    assert (tmp_path / "other" / "episodes.csv").read_bytes() != (small_run / "episodes.csv").read_bytes()
+
+
+def test_killed_and_resumed_on_a_mujoco_task(tmp_path):
+    run(*HOPPER, "--run-dir", "whole", cwd=tmp_path)
+    for at_row in (4, 11):
+        assert stop_in_the_middle(HOPPER, tmp_path / "killed", signal.SIGKILL, at_row) == -signal.SIGKILL
+    run(*HOPPER, "--run-dir", "killed", "--resume", cwd=tmp_path)
+    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+
+
+def test_killed_and_resumed_with_several_environments(tmp_path):
+    flags = [*SMALL, "--num-envs", "2", "--num-steps", "128", "--bootstrap-truncated", "--kl-samples", "batch"]
+    run(*flags, "--run-dir", "whole", cwd=tmp_path)
+    stop_in_the_middle(flags, tmp_path / "killed", signal.SIGKILL, 3)
+    run(*flags, "--run-dir", "killed", "--resume", cwd=tmp_path)
+    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
+def test_a_signal_checkpoints_and_ends(number, small_run, tmp_path):
+    flags = [flag if flag != "1" else "100000" for flag in SMALL]  # no checkpoint but the signal's
+    assert stop_in_the_middle(flags, tmp_path / "run", number, 2) == 128 + number
+    assert (tmp_path / "run" / "checkpoint.pt").exists() and not (tmp_path / "run" / "result.json").exists()
+    done = run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert "differs" not in done.stderr
+    assert_same_run(small_run, tmp_path / "run")
+
+
+def test_resume_starts_where_there_is_nothing_and_is_done_where_all_is(small_run, tmp_path):
+    run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert_same_run(small_run, tmp_path / "run")
+    before = (tmp_path / "run" / "result.json").read_bytes()
+    assert "done" in run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path).stdout
+    assert (tmp_path / "run" / "result.json").read_bytes() == before
+
+
+def test_stop_at_ends_early_on_the_full_schedule(small_run, tmp_path):
+    run(*SMALL, "--run-dir", "run", "--stop-at", 1000, cwd=tmp_path)
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["global_step"] == 1024
+    first = (small_run / "updates.csv").read_bytes().splitlines()[:5]
+    assert (tmp_path / "run" / "updates.csv").read_bytes().splitlines() == first
+    run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert_same_run(small_run, tmp_path / "run")
+
+
+@pytest.mark.parametrize("damage", [lambda content: content[: len(content) // 2], lambda content: b"", bytes.swapcase])
+def test_a_torn_checkpoint_falls_back_to_the_one_before(damage, small_run, tmp_path):
+    shutil.copytree(small_run, tmp_path / "run")
+    path = tmp_path / "run" / "checkpoint.pt"
+    path.write_bytes(damage(path.read_bytes()))
+    (tmp_path / "run" / "result.json").unlink()
+    done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert "torn" in done.stderr
+    assert_same_run(small_run, tmp_path / "run")
+
+
+def test_killed_between_the_two_renames_of_a_checkpoint(small_run, tmp_path):
+    shutil.copytree(small_run, tmp_path / "run")
+    os.replace(tmp_path / "run" / "checkpoint.pt", tmp_path / "run" / "checkpoint.pt.tmp")
+    (tmp_path / "run" / "result.json").unlink()
+    run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert_same_run(small_run, tmp_path / "run")
+
+
+def test_killed_before_the_first_checkpoint(small_run, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "args.json.tmp").write_text("{")
+    run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert_same_run(small_run, tmp_path / "run")
+
+
+def test_another_machines_episode_is_said(small_run, tmp_path, monkeypatch):
+    """Where the replayed episode differs, the run says so and goes on."""
+    import torch
+
+    shutil.copytree(small_run, tmp_path / "run")
+    path = tmp_path / "run" / "checkpoint.previous.pt"
+    state = torch.load(path, weights_only=True)
+    state["collector"]["raw_obs"] += 1e-9
+    torch.save(state, tmp_path / "run" / "checkpoint.pt")
+    (tmp_path / "run" / "result.json").unlink()
+    done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert "replayed episode differs" in done.stderr
+
+
+def test_a_full_disk_stops_the_run_with_a_whole_checkpoint(small_run, tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk], capture_output=True, text=True)
+    if mount.returncode:
+        pytest.skip(f"cannot mount a small disk here: {mount.stderr.strip()}")
+    try:
+        process = subprocess.Popen(
+            command(*SMALL, "--run-dir", disk / "run"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        while rows(disk / "run") < 3:
+            assert process.poll() is None
+            time.sleep(0.002)
+        with open(disk / "filler", "wb") as filler:
+            try:
+                while True:
+                    filler.write(b"x" * 1024)
+                    filler.flush()
+            except OSError:
+                pass
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == 1, err
+        assert err.count("\n") == 1 and "No space left" in err and "--resume" in err, err
+        (disk / "filler").unlink()
+        shutil.copytree(disk / "run", tmp_path / "run")
+        run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+        assert_same_run(small_run, tmp_path / "run")
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_twenty_runs_killed_at_random_end_with_the_same_bytes(tmp_path):
+    """Each is killed two or three times, at any moment from the start of Python on; one in two compiled."""
+    flags = {"plain": HOPPER, "compiled": [*HOPPER, "--compile"]}
+    seconds = {}
+    for kind in flags:
+        for _ in range(2):  # the second one finds the compiler's cache filled
+            shutil.rmtree(tmp_path / kind, ignore_errors=True)
+            start = time.time()
+            run(*flags[kind], "--run-dir", kind, cwd=tmp_path)
+            seconds[kind] = time.time() - start
+
+    def kill_and_resume(number: int) -> int:
+        rng = random.Random(number)
+        kind = ("plain", "compiled")[number % 2]
+        folder, kills = tmp_path / f"run{number}", 0
+        for _ in range(rng.randint(2, 3)):
+            line = command(*flags[kind], "--run-dir", folder, "--resume")
+            process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            try:
+                process.wait(timeout=rng.uniform(1.0, 1.3 * seconds[kind]))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                kills += 1
+        run(*flags[kind], "--run-dir", folder, "--resume", cwd=tmp_path)
+        assert_same_run(tmp_path / kind, folder)
+        return kills
+
+    with ThreadPoolExecutor(2) as pool:
+        kills = list(pool.map(kill_and_resume, range(20)))
+    print(f"20 runs, {sum(kills)} kills", file=sys.stderr)
+    assert sum(kills) >= 30
