@@ -22,10 +22,10 @@ def command(*flags: object, script: Path = SCRIPT) -> list[str]:
     return [sys.executable, str(script), *map(str, flags)]
 
 
-def run(*flags: object, cwd: Path, code: int = 0, **environment: str) -> subprocess.CompletedProcess:
+def run(*flags: object, cwd: Path, code: int = 0, script: Path = SCRIPT, **environment: str) -> subprocess.CompletedProcess:
     """Run the script to its end and check its exit code."""
     env = {**os.environ, **environment}
-    done = subprocess.run(command(*flags), cwd=cwd, env=env, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(command(*flags, script=script), cwd=cwd, env=env, capture_output=True, text=True, timeout=600)
     assert done.returncode == code, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
     return done
 

@@ -1,0 +1,70 @@
+"""The one-file rule: a name that stands in several method files means the same code in each."""
+
+import ast
+from collections import defaultdict
+from itertools import combinations
+from pathlib import Path
+
+METHODS = sorted(
+    path for path in (Path(__file__).parent.parent / "cleanrl_thesis").glob("*.py") if path.name != "__init__.py"
+)
+# (name, file): one line that says why it differs there
+DIFFERS: dict[tuple[str, str], str] = {}
+OWN = {"Args", "Agent", "main", "evaluate", "CHECKPOINT_FORMAT", "FREE_ON_RESUME"}  # each method's own by design
+
+
+def definitions(source: str) -> dict[str, str]:
+    """Each top-level class, function and constant of a file, as the dump of its syntax tree."""
+    found = {}
+    for node in ast.parse(source).body:
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
+            found[node.name] = ast.dump(node)
+        elif isinstance(node, ast.Assign):
+            for target in ast.walk(ast.Tuple(node.targets, ast.Store())):
+                if isinstance(target, ast.Name) and isinstance(target.ctx, ast.Store):
+                    found[target.id] = ast.dump(node)
+    return found
+
+
+def differing(files: dict[str, str]) -> list[tuple[str, str, str]]:
+    """(name, file, other file) of every definition that is not word for word its twin."""
+    by_name = defaultdict(dict)
+    for file, source in files.items():
+        for name, dump in definitions(source).items():
+            by_name[name][file] = dump
+    return [
+        (name, one, other)
+        for name, copies in by_name.items()
+        if name not in OWN
+        for one, other in combinations(copies, 2)
+        if copies[one] != copies[other] and not {(name, one), (name, other)} & DIFFERS.keys()
+    ]
+
+
+def imported_modules(source: str) -> set[str]:
+    """The first part of every imported module's name."""
+    names = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names.add("." if node.level else node.module.split(".")[0])
+    return names
+
+
+def test_twins_are_equal():
+    assert differing({path.name: path.read_text() for path in METHODS}) == []
+
+
+def test_no_method_imports_another():
+    for path in METHODS:
+        forbidden = {"cleanrl_thesis", ".", *(other.stem for other in METHODS)}
+        assert not imported_modules(path.read_text()) & forbidden, path.name
+
+
+def test_a_changed_twin_would_be_found():
+    one = "def f(x):\n    return x\n\nC, D = 1, 2\n"
+    assert differing({"a.py": one, "b.py": one + "# a comment\n"}) == []
+    assert differing({"a.py": one, "b.py": one.replace("return x", "return -x")}) == [("f", "a.py", "b.py")]
+    assert differing({"a.py": one, "b.py": one.replace("1, 2", "1, 3")}) == [("C", "a.py", "b.py"), ("D", "a.py", "b.py")]
+    assert imported_modules("from . import x\nimport cleanrl_thesis.y") == {".", "cleanrl_thesis"}
