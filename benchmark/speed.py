@@ -90,7 +90,10 @@ def measure(work: Work, rounds: int) -> dict:
         for name, contender in CONTENDERS.items():
             figures[name].append(contender(work))
             speed = figures[name][-1]["steps_per_second"]
-            print(f"{work.env_id} K={work.update_epochs} round {round_number + 1} {name}: {speed:,.0f} steps/s", flush=True)
+            print(
+                f"{work.env_id} K={work.update_epochs} round {round_number + 1} {name}: {speed:,.0f} steps/s",
+                flush=True,
+            )
     speeds = {name: [row["steps_per_second"] for row in rows] for name, rows in figures.items()}
     ratios = {name: [own / peer for own, peer in zip(speeds[name], speeds[PEER])] for name in CONTENDERS}
     memory = {name: max(row["peak_memory_mb"] for row in rows) for name, rows in figures.items()}
@@ -118,7 +121,9 @@ def main(args: Args) -> None:
     for work in PPO_WORK:
         results.append(measure(work, args.rounds))
         (args.out / f"{args.what}.json").write_text(json.dumps({**about, "results": results}, indent=1) + "\n")
-    heading = f"Steps per second, {args.rounds} rounds in turn, one thread each (`{about['command']}`, commit {commit[:7]})"
+    heading = (
+        f"Steps per second, {args.rounds} rounds in turn, one thread each (`{about['command']}`, commit {commit[:7]})"
+    )
     (args.out / f"{args.what}.md").write_text(f"{heading}\n\n{table(results)}")
     print(table(results))
 

@@ -49,6 +49,7 @@ import csv
 import fcntl
 import functools
 import hashlib
+import importlib.util
 import io
 import json
 import math
@@ -60,6 +61,7 @@ import shutil
 import signal
 import sys
 import time
+import warnings
 import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -224,71 +226,55 @@ def parse_args(argv: list[str] | None = None) -> Args:
 def require(holds: bool, flag: str, value: object, allowed: str) -> None:
     """Raise UsageError naming the flag, its value and what is allowed, unless `holds`."""
     if not holds:
-        raise UsageError(f"{flag} {value}: {allowed}")
+        raise UsageError(f"{flag} {value}".strip() + f": {allowed}")
 
 
 def complete_args(args: Args) -> Args:
-    """Check every value and fill in those that follow from others. Raises UsageError."""
-    for name in ("num_threads", "num_envs", "num_minibatches", "update_epochs", "eval_episodes", "checkpoint_interval"):
-        value = getattr(args, name)
-        require(value >= 1, f"--{name.replace('_', '-')}", value, "must be at least 1")
-    for name in ("learning_rate", "d_target", "clip_coef", "max_grad_norm", "clip_obs", "clip_reward"):
-        value = getattr(args, name)
-        require(value > 0, f"--{name.replace('_', '-')}", value, "must be greater than 0")
-    for name in ("learning_rate", "d_target"):
-        value = getattr(args, name)
-        require(math.isfinite(value), f"--{name.replace('_', '-')}", value, "must be finite")
-    for name in ("ent_coef", "vf_coef"):
-        value = getattr(args, name)
-        require(0 <= value < math.inf, f"--{name.replace('_', '-')}", value, "must be finite and at least 0")
-    for name in ("gamma", "gae_lambda"):
-        value = getattr(args, name)
-        require(0 <= value <= 1, f"--{name.replace('_', '-')}", value, "must be between 0 and 1")
-    require(0 <= args.seed < 2**32, "--seed", args.seed, "must be between 0 and 4294967295")
-    require(args.save_demos >= 0, "--save-demos", args.save_demos, "must be at least 0")
-    gains_hold = all(math.isfinite(gain) for gain in args.init_gains)
-    require(gains_hold, "--init-gains", " ".join(map(str, args.init_gains)), "must be three finite numbers")
+    """Fill in the values that follow from others, and check all. Raises UsageError."""
+    if args.num_steps is None:
+        divides = args.num_envs >= 1 and 2048 % args.num_envs == 0
+        require(divides, "--num-envs", args.num_envs, "must divide 2048, or give --num-steps too")
+        args.num_steps = 2048 // args.num_envs
+    args.value_learning_rate = args.learning_rate if args.value_learning_rate is None else args.value_learning_rate
+    args.kl_timing = args.kl_timing or ("after-iteration" if args.kle_rollback else "before-last-step")
+    args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
+    counts = "num_threads num_envs num_steps num_minibatches update_epochs eval_episodes checkpoint_interval stop_at"
+    for names, holds, allowed in (
+        (counts, lambda x: x >= 1, "must be at least 1"),
+        ("learning_rate value_learning_rate d_target", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
+        ("clip_coef max_grad_norm clip_obs clip_reward", lambda x: x > 0, "must be greater than 0"),
+        ("ent_coef vf_coef", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
+        ("gamma gae_lambda", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
+        ("init_gains", lambda gains: all(map(math.isfinite, gains)), "must be three finite numbers"),
+        ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
+        ("save_demos", lambda x: x >= 0, "must be at least 0"),
+    ):
+        for name in names.split():
+            require(holds(getattr(args, name)), f"--{name.replace('_', '-')}", getattr(args, name), allowed)
     require(not (args.kle_stop and args.kle_rollback), "--kle-stop --kle-rollback", "", "choose one of the two")
     require(not args.resume or args.run_dir is not None, "--resume", "", "needs --run-dir, the folder to go on in")
 
-    if args.num_steps is None:
-        require(2048 % args.num_envs == 0, "--num-envs", args.num_envs, "must divide 2048, or give --num-steps too")
-        args.num_steps = 2048 // args.num_envs
-    require(args.num_steps >= 1, "--num-steps", args.num_steps, "must be at least 1")
-    if args.value_learning_rate is None:
-        args.value_learning_rate = args.learning_rate
-    rate = args.value_learning_rate
-    require(0 < rate < math.inf, "--value-learning-rate", rate, "must be finite and greater than 0")
-    if args.kl_timing is None:
-        args.kl_timing = "after-iteration" if args.kle_rollback else "before-last-step"
-
     args.batch_size = args.num_envs * args.num_steps
-    divides = args.batch_size % args.num_minibatches == 0
-    require(divides, "--num-minibatches", args.num_minibatches, f"must divide the batch of {args.batch_size} steps")
     args.minibatch_size = args.batch_size // args.num_minibatches
-    enough = args.minibatch_size > 1 or not args.norm_adv
-    require(
-        enough, "--num-minibatches", args.num_minibatches, "must leave at least 2 steps to normalise advantages over"
-    )
     args.num_iterations = args.total_timesteps // args.batch_size
+    rest, flag = args.batch_size % args.num_minibatches, "--num-minibatches"
+    require(rest == 0, flag, args.num_minibatches, f"must divide the batch of {args.batch_size} steps")
+    enough = args.minibatch_size >= 2 or not args.norm_adv
+    require(enough, flag, args.num_minibatches, "must leave at least 2 steps to normalise advantages over")
     allowed = f"must be at least one batch, {args.batch_size} steps"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
-    if args.stop_at is not None:
-        require(args.stop_at >= 1, "--stop-at", args.stop_at, "must be at least 1")
-    if args.track:
-        try:
-            import wandb  # noqa: F401
-        except ImportError:
-            raise UsageError("--track: needs Weights and Biases: pip install wandb") from None
+    if args.track and importlib.util.find_spec("wandb") is None:
+        raise UsageError("--track: needs Weights and Biases: pip install wandb")
+    if args.capture_video and importlib.util.find_spec("moviepy") is None:
+        raise UsageError("--capture-video: needs moviepy: pip install moviepy")
     return args
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The tasks of the study
 # ---------------------------------------------------------------------------------------------------------------------
-BOX, CAPSULE, CYLINDER, SPHERE = (
-    getattr(mujoco.mjtGeom, f"mjGEOM_{n}") for n in ("BOX", "CAPSULE", "CYLINDER", "SPHERE")
-)
+BOX, CAPSULE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE
+CYLINDER, SPHERE = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE
 
 
 class ZeroContactHumanoidEnv(HumanoidEnv):
@@ -535,6 +521,15 @@ STUDY_TASKS = {
 for task_name, (task_entry_point, task_max_steps) in STUDY_TASKS.items():
     if f"kle/{task_name}-v2" not in gym.registry:
         gym.register(f"kle/{task_name}-v2", task_entry_point, max_episode_steps=task_max_steps)
+
+
+def report_mujoco_warning(text: str) -> None:
+    """Pass MuJoCo's warnings to Python's; MuJoCo itself writes each to a file in the working folder."""
+    if "settotalmass" not in text:  # HalfCheetah's model, at every start
+        warnings.warn(f"MuJoCo: {text}", stacklevel=2)
+
+
+mujoco.set_mju_user_warning(report_mujoco_warning)
 
 
 def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
@@ -826,10 +821,8 @@ def gae(rewards: np.ndarray, values: np.ndarray, dones: np.ndarray, gamma: float
     rewards (T, N), values (T + 1, N), dones (T, N), 1 where the episode ended with step t -> advantages (T, N).
     """
     advantages = np.empty_like(rewards)
-    columns = zip(
-        rewards.T.tolist(), values.T.tolist(), dones.T.tolist()
-    )  # lists: five times faster than numpy scalars
-    for i, (reward, value, done) in enumerate(columns):
+    columns = (array.T.tolist() for array in (rewards, values, dones))  # lists: five times faster than numpy scalars
+    for i, (reward, value, done) in enumerate(zip(*columns)):
         advantage = 0.0
         for t in range(len(reward) - 1, -1, -1):
             alive = 1.0 - done[t]
@@ -1195,7 +1188,7 @@ def check_same_run(args: Args, run_dir: Path) -> None:
     current = json.loads(json.dumps(asdict(args), default=str))
     changed = [name for name in current if name not in FREE_ON_RESUME and current[name] != saved.get(name)]
     differences = [f"--{name.replace('_', '-')} {current[name]} (was {saved.get(name)})" for name in changed]
-    require(not changed, "--resume:", ", ".join(differences), f"must be as in {run_dir}")
+    require(not changed, "--resume", ", ".join(differences), f"must be as in {run_dir}")
 
 
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
@@ -1224,7 +1217,7 @@ class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
     def __init__(self, path: Path, offset: int):
-        self.file = open(path, "a", newline="")
+        self.file = open(path, "a", newline="")  # noqa: SIM115
         self.file.truncate(offset)
         self.writer = csv.writer(self.file, lineterminator="\n")
         self.columns: list[str] = []
@@ -1290,16 +1283,12 @@ def play(agent: Agent, env: gym.Env, args: Args, seed: int) -> dict[str, np.ndar
 
 
 def check_video(env_id: str) -> None:
-    """Raise UsageError where a video could not be made, before hours are spent on training."""
+    """Raise UsageError where the environment cannot be drawn, before hours are spent on training."""
     try:
-        import moviepy  # noqa: F401
-
         env = make_env(env_id, "rgb_array")
         env.reset(seed=0)
         env.render()
         env.close()
-    except ImportError:
-        raise UsageError("--capture-video: needs moviepy: pip install moviepy") from None
     except Exception as error:  # each renderer has its own
         raise UsageError(f"--capture-video: cannot draw {env_id} here: {str(error).splitlines()[0]}") from None
 
@@ -1429,9 +1418,7 @@ def main(args: Args) -> int:
     if args.capture_video:
         check_video(args.env_id)
     run_dir, checkpoint = open_run_dir(args)
-    last_iteration = args.num_iterations
-    if args.stop_at is not None:
-        last_iteration = min(last_iteration, math.ceil(args.stop_at / args.batch_size))
+    last_iteration = min(args.num_iterations, math.ceil(args.stop_at / args.batch_size))
     if (run_dir / "result.json").exists() and checkpoint and checkpoint["iteration"] >= last_iteration:
         print(f"{run_dir} is done")
         return 0

@@ -22,7 +22,9 @@ def command(*flags: object, script: Path = SCRIPT) -> list[str]:
     return [sys.executable, str(script), *map(str, flags)]
 
 
-def run(*flags: object, cwd: Path, code: int = 0, script: Path = SCRIPT, **environment: str) -> subprocess.CompletedProcess:
+def run(
+    *flags: object, cwd: Path, code: int = 0, script: Path = SCRIPT, **environment: str
+) -> subprocess.CompletedProcess:
     """Run the script to its end and check its exit code."""
     env = {**os.environ, **environment}
     done = subprocess.run(command(*flags, script=script), cwd=cwd, env=env, capture_output=True, text=True, timeout=600)

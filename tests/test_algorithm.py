@@ -16,7 +16,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 
 from cleanrl_thesis import ppo_continuous_kle as ppo
 
-B, O, A = 256, 5, 3
+B, O, A = 256, 5, 3  # noqa: E741
 CPU = torch.device("cpu")
 
 
@@ -60,7 +60,11 @@ def test_log_prob_and_kl_are_those_of_torch_distributions():
 def test_k1_and_k3_estimate_the_divergence_from_old_to_new():
     """With actions of the old policy their means approach D(old ‖ new), and not the direction of Eq. 4.3.1."""
     torch.manual_seed(0)
-    agent, old_mean, old_logstd = make_agent(make_args()), torch.tensor([0.5, -0.3, 0.2]), torch.tensor([0.4, 0.0, -0.3])
+    agent, old_mean, old_logstd = (
+        make_agent(make_args()),
+        torch.tensor([0.5, -0.3, 0.2]),
+        torch.tensor([0.4, 0.0, -0.3]),
+    )
     rows = 400_000
     actions = old_mean + old_logstd.exp() * torch.randn(rows, A)
     logprobs = ppo.gaussian_log_prob(old_mean.expand(rows, A), old_logstd, actions)
@@ -232,7 +236,9 @@ def update_pair(args: ppo.Args, make_second) -> tuple[ppo.Agent, ppo.Agent]:
     for make in (ppo.PlainUpdate, make_second):
         agent = make_agent(args)
         optimizer = ppo.make_optimizer(agent, 3e-3, 1e-3)
-        loss = functools.partial(ppo.ppo_loss, clip_coef=0.2, clip_vloss=True, norm_adv=True, ent_coef=0.01, vf_coef=0.5)
+        loss = functools.partial(
+            ppo.ppo_loss, clip_coef=0.2, clip_vloss=True, norm_adv=True, ent_coef=0.01, vf_coef=0.5
+        )
         rows = random_batch(agent).pack()
         update = make(agent, optimizer, loss, args.max_grad_norm)
         for i in range(20):
@@ -245,7 +251,9 @@ def assert_close_agents(left: ppo.Agent, right: ppo.Agent) -> None:
     start = make_agent(make_args())
     for name, value in left.named_parameters():
         torch.testing.assert_close(value, right.get_parameter(name), rtol=1e-3, atol=2e-5)
-        assert (value - start.get_parameter(name)).abs().max() > 5e-4, f"{name} did not move: the test would show nothing"
+        assert (value - start.get_parameter(name)).abs().max() > 5e-4, (
+            f"{name} did not move: the test would show nothing"
+        )
 
 
 @pytest.mark.parametrize("max_grad_norm", [0.05, math.inf])
@@ -349,7 +357,9 @@ def test_rollback_restores_bit_for_bit(monkeypatch, scope, compiled, crossing):
 
     def scripted(agent, batch, old_logstd):
         measured.append(0)
-        return dict.fromkeys(("k1", "k3", "exact-old-new", "exact-new-old"), torch.tensor(float(len(measured) == crossing)))
+        return dict.fromkeys(
+            ("k1", "k3", "exact-old-new", "exact-new-old"), torch.tensor(float(len(measured) == crossing))
+        )
 
     def snapshot(update):
         def wrapped(rows):

@@ -29,6 +29,7 @@ BAD = [
     (["--num-minibatches", "31"], ["--num-minibatches", "31", "2048"]),
     (["--num-minibatches", "2048"], ["--num-minibatches", "2048", "at least 2"]),
     (["--num-envs", "3"], ["--num-envs", "3", "2048"]),
+    (["--num-steps", "0"], ["--num-steps", "0", "at least 1"]),
     (["--num-envs", "0"], ["--num-envs", "0"]),
     (["--total-timesteps", "100"], ["--total-timesteps", "100", "2048"]),
     (["--learning-rate", "nan"], ["--learning-rate", "nan"]),
@@ -65,7 +66,7 @@ def test_a_wrong_value_is_one_line_and_creates_nothing(flags, words, tmp_path, m
 
 def test_a_wrong_value_has_no_traceback_in_a_shell(tmp_path):
     done = run("--d-target", 0, cwd=tmp_path, code=2)
-    assert done.stderr == "error: --d-target 0.0: must be greater than 0\n" and done.stdout == ""
+    assert done.stderr == "error: --d-target 0.0: must be greater than 0 and finite\n" and done.stdout == ""
     assert list(tmp_path.iterdir()) == []
 
 
@@ -118,7 +119,9 @@ def flipped(folder: Path) -> None:
     (folder / "checkpoint.pt").write_bytes(content)
 
 
-@pytest.mark.parametrize("damage", [foreign, pickled, flipped, lambda folder: (folder / "checkpoint.pt").write_bytes(b"")])
+@pytest.mark.parametrize(
+    "damage", [foreign, pickled, flipped, lambda folder: (folder / "checkpoint.pt").write_bytes(b"")]
+)
 def test_a_corrupt_or_foreign_checkpoint_is_refused(copied_run, capsys, damage):
     (copied_run / "result.json").unlink()
     (copied_run / "checkpoint.previous.pt").unlink()

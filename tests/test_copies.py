@@ -66,5 +66,8 @@ def test_a_changed_twin_would_be_found():
     one = "def f(x):\n    return x\n\nC, D = 1, 2\n"
     assert differing({"a.py": one, "b.py": one + "# a comment\n"}) == []
     assert differing({"a.py": one, "b.py": one.replace("return x", "return -x")}) == [("f", "a.py", "b.py")]
-    assert differing({"a.py": one, "b.py": one.replace("1, 2", "1, 3")}) == [("C", "a.py", "b.py"), ("D", "a.py", "b.py")]
+    assert differing({"a.py": one, "b.py": one.replace("1, 2", "1, 3")}) == [
+        ("C", "a.py", "b.py"),
+        ("D", "a.py", "b.py"),
+    ]
     assert imported_modules("from . import x\nimport cleanrl_thesis.y") == {".", "cleanrl_thesis"}

@@ -15,7 +15,17 @@ OLD_MODELS = json.loads((Path(__file__).parent / "data" / "old_arm_models.json")
 STUDY = [f"kle/{name}-v2" for name in ppo.STUDY_TASKS]
 V5 = [
     f"{name}-v5"
-    for name in ("Ant", "HalfCheetah", "Hopper", "Humanoid", "InvertedPendulum", "Pusher", "Reacher", "Swimmer", "Walker2d")
+    for name in (
+        "Ant",
+        "HalfCheetah",
+        "Hopper",
+        "Humanoid",
+        "InvertedPendulum",
+        "Pusher",
+        "Reacher",
+        "Swimmer",
+        "Walker2d",
+    )
 ]
 OBSERVATIONS = {
     "Ant": 27, "HalfCheetah": 17, "Hopper": 11, "Humanoid": 376, "InvertedPendulum": 4, "Pusher": 23,

@@ -1,0 +1,70 @@
+"""The report's numbers against scipy and by hand, and the timing tool's table."""
+
+import csv
+import importlib.util
+import json
+import sys
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from scipy import stats
+
+
+def load(name: str):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmark" / f"{name}.py")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+report, speed = load("report"), load("speed")
+
+
+def test_interval_is_that_of_the_t_test():
+    ours, theirs = [3.0, 5.0, 4.5, 7.0], [1.0, 2.5]
+    expected = stats.ttest_ind(ours, theirs).confidence_interval(0.95)
+    assert report.difference_interval(ours, theirs) == pytest.approx((expected.low, expected.high))
+
+
+def fake_run(folder, task: str, seed: int, returns: list[float]) -> None:
+    run = folder / f"{task}__seed{seed}"
+    run.mkdir(parents=True)
+    rows = "".join(f"{1000 * (i + 1)},{value},1000\n" for i, value in enumerate(returns))
+    (run / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + rows)
+    result = {"env_id": f"kle/{task}", "seed": seed, "global_step": 1000 * len(returns), "training_seconds": 3600.0}
+    (run / "result.json").write_text(json.dumps({**result, "evaluation": {"mean": 1.0}}))
+
+
+def test_report_of_part_of_the_runs(tmp_path):
+    rng = np.random.default_rng(0)
+    returns = {seed: rng.normal(1600, 50, 200).tolist() for seed in (1, 2)}
+    for seed, values in returns.items():
+        fake_run(tmp_path / "runs", "HalfCheetah-v2", seed, values)
+    (tmp_path / "runs" / "HalfCheetah-v2__seed3").mkdir()  # not finished
+    report.ppo_k10(tmp_path / "runs", tmp_path / "out")
+    with open(tmp_path / "out" / "runs.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["last_50"]) for row in rows] == pytest.approx(
+        [np.mean(returns[s][-50:]) for s in (1, 2)], abs=0.01
+    )
+    assert [float(row["last_episode"]) for row in rows] == pytest.approx([returns[s][-1] for s in (1, 2)], abs=0.01)
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert text.startswith("2 runs, 2.0 core-hours") and "| HalfCheetah-v2 | last episode | 1,804, 1,448 |" in text
+    assert "| Hopper-v2 | last episode | 3,609, 1,276 | not done |" in text
+    assert (tmp_path / "out" / "learning_curves.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_difference_outside_the_interval_is_marked():
+    published = [{"task": "T", "seed": str(s), "last_episode": "100", "last_50": str(99 + s)} for s in (1, 2)]
+    runs = [{"task": "T", "seed": s, "last_episode": 100.0, "last_50": 200.0 + s} for s in (1, 2, 3)]
+    table = report.ppo_k10_table(published, runs)
+    assert table.count("**outside**") == 1 and "**outside**" in table.splitlines()[3]
+
+
+def test_speed_table_has_medians_and_ratios_round_by_round():
+    speeds = {"stable-baselines3": [100.0, 200.0, 150.0], "plain": [400.0, 600.0, 300.0]}
+    ratio = {name: [a / b for a, b in zip(values, speeds["stable-baselines3"])] for name, values in speeds.items()}
+    memory = dict.fromkeys(speeds, 500.0)
+    row = {"env_id": "T", "update_epochs": 10, "steps_per_second": speeds, "ratio": ratio, "peak_memory_mb": memory}
+    assert "| T | 10 | plain | 400 | 3.00 | 2.00 to 4.00 | 500 |" in speed.table([row])
