@@ -35,10 +35,12 @@ def read_csv(path: Path) -> list[dict[str, str]]:
 
 
 def read_runs(folder: Path) -> list[dict]:
-    """One row for every run that is done: what Table 4.4 and its steadier form need, and what it cost."""
+    """One row for every run that came to the end of its schedule: what Table 4.4 and its steadier form need, and what it cost."""
     rows = []
     for path in sorted(folder.glob("*/result.json")):
         result, episodes = json.loads(path.read_text()), read_csv(path.parent / "episodes.csv")
+        if not result["complete"]:
+            continue
         returns = [float(row["episodic_return"]) for row in episodes]
         rows.append(
             {

@@ -55,11 +55,12 @@ def run_process(command: list[str], folder: str) -> tuple[str, float]:
     """Run a command with one thread; return what it prints and its peak resident memory in MB."""
     single = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
     env = {**os.environ, **single}
-    process = subprocess.Popen(command, cwd=folder, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    out, err = process.stdout.read(), process.stderr.read()
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(command, cwd=folder, env=env, **streams)
+    out = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
     if status != 0:
-        raise SystemExit(f"{' '.join(command)} failed:\n{err}")
+        raise SystemExit(f"{' '.join(command)} failed:\n{out}")
     return out, usage.ru_maxrss / 1024
 
 

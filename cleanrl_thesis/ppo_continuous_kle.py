@@ -5,7 +5,8 @@
     python cleanrl_thesis/ppo_continuous_kle.py --kle-rollback --d-target 0.03      # stop and undo the last iteration
 
 Tasks: the eleven of the study as `kle/Ant-v2`, ..., `kle/Walker2d-v2`, and any Gymnasium environment with `Box`
-observations and actions. `--run-dir DIR --resume` can be sent again after every crash: the run ends with the same bytes.
+observations and actions. `--run-dir DIR --resume` can be sent again after every crash: on the same machine the run
+ends with the same bytes.
 
 Three settings of the same file:
 
@@ -126,9 +127,9 @@ class Args:
     env_id: str = "kle/Hopper-v2"
     """the environment: `kle/{Ant,HalfCheetah,Hopper,Humanoid,InvertedPendulum,Pusher,Reacher,Striker,Swimmer,Thrower,Walker2d}-v2` or a Gymnasium id"""
     total_timesteps: int = 2_000_000
-    """environment steps N_T (Table 4.1)"""
+    """environment steps N_T, rounded down to whole batches (Table 4.1)"""
     num_envs: int = 1
-    """environments stepped in turn; the batch stays the same"""
+    """environments stepped in turn"""
     num_steps: int | None = None
     """steps per environment and iteration; default: 2,048 / num_envs (as run; openai/baselines)"""
     learning_rate: float = 3e-4
@@ -223,6 +224,10 @@ def parse_args(argv: list[str] | None = None) -> Args:
         raise UsageError(message.split("Argument helptext")[0].strip()) from None
 
 
+def first_line(error: Exception) -> str:
+    return (str(error) or repr(error)).splitlines()[0]
+
+
 def require(holds: bool, flag: str, value: object, allowed: str) -> None:
     """Raise UsageError naming the flag, its value and what is allowed, unless `holds`."""
     if not holds:
@@ -295,7 +300,7 @@ class ArmEnv(MujocoEnv):
     """
 
     metadata = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"], "render_fps": 20}
-    bodies, reset_speed = ("tips_arm", "object", "goal"), 0.005
+    bodies, reset_speed, effort_weight = ("tips_arm", "object", "goal"), 0.005, 0.1
 
     def __init__(self, freeze: bool = False, **kwargs):
         self.freeze, self.frozen, self.nearest = freeze, None, np.inf
@@ -310,14 +315,12 @@ class ArmEnv(MujocoEnv):
         return model, mujoco.MjData(model)
 
     def step(self, action):
-        reward = self.reward(*(self.data.body(name).xpos for name in self.bodies)) - self.effort(action)
+        reward = self.reward(*(self.data.body(name).xpos for name in self.bodies))
+        reward -= self.effort_weight * float(np.square(action).sum())
         self.do_simulation(action, self.frame_skip)
         if self.render_mode == "human":
             self.render()
         return self._get_obs(), reward, False, False, {}
-
-    def effort(self, action: np.ndarray) -> float:
-        return 0.1 * float(np.square(action).sum())
 
     def reset_model(self) -> np.ndarray:
         self.frozen, self.nearest = None, np.inf
@@ -404,7 +407,7 @@ class StrikerEnv(ArmEnv):
 class ThrowerEnv(ArmEnv):
     """Throw a ball into a box."""
 
-    bodies = ("r_wrist_roll_link", "ball", "goal")
+    bodies, effort_weight = ("r_wrist_roll_link", "ball", "goal"), 0.002
     joints = {  # axis None: as in the Pusher
         "r_shoulder_pan_joint": ([-0.4854, 1.214602], None),
         "r_shoulder_lift_joint": ([-0.5236, 0.7963], None),
@@ -473,9 +476,6 @@ class ThrowerEnv(ArmEnv):
             self.frozen = ball.copy()
         return -distance((ball if self.frozen is None else self.frozen)[:2], goal[:2])
 
-    def effort(self, action: np.ndarray) -> float:
-        return 0.002 * float(np.square(action).sum())
-
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.linalg.norm(a - b))
@@ -524,7 +524,7 @@ for task_name, (task_entry_point, task_max_steps) in STUDY_TASKS.items():
 
 
 def report_mujoco_warning(text: str) -> None:
-    """Pass MuJoCo's warnings to Python's; MuJoCo itself writes each to a file in the working folder."""
+    """Pass MuJoCo's warnings on to Python's; otherwise each goes to a file in the working folder."""
     if "settotalmass" not in text:  # HalfCheetah's model, at every start
         warnings.warn(f"MuJoCo: {text}", stacklevel=2)
 
@@ -537,7 +537,7 @@ def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
     try:
         env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True)
     except (gym.error.Error, ImportError, TypeError, ValueError) as error:
-        raise UsageError(f"--env-id {env_id}: {str(error).splitlines()[0]}") from None
+        raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     for name, space in (("observations", env.observation_space), ("actions", env.action_space)):
         require(isinstance(space, gym.spaces.Box), "--env-id", env_id, f"needs Box {name}, this one has {space}")
     return env
@@ -659,7 +659,8 @@ class Episode:
     """An environment and the episode that it is in.
 
     Each reset has a seed of its own, so the episode's number and actions determine the environment's state: a
-    checkpoint keeps those two, and `replay` plays them again.
+    checkpoint keeps those two, and `replay` plays them again. Holds for every environment whose randomness comes from
+    `reset(seed=)`.
     """
 
     def __init__(self, env: gym.Env, seed: int, stream: int, gamma: float):
@@ -726,8 +727,8 @@ class Collector:
         """Raw observations (..., O) to the agent's input (section 4.3.2, item 3)."""
         if not self.args.norm_obs:
             return obs
-        scaled = (obs - self.obs_stats.mean) / self.obs_stats.divisor(self.args.norm_divisor)
-        return bounded(scaled, -self.args.clip_obs, self.args.clip_obs)
+        divisor = self.obs_stats.divisor(self.args.norm_divisor)
+        return bounded((obs - self.obs_stats.mean) / divisor, -self.args.clip_obs, self.args.clip_obs)
 
     def scale_reward(self, reward: float, discounted_return: float) -> float:
         """Divide by the running scale of the discounted return (section 4.3.2, item 4)."""
@@ -805,7 +806,12 @@ class Collector:
 def gaussian_log_prob(mean: torch.Tensor, logstd: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
     """log π(a|s) of a diagonal Gaussian: mean (B, A), logstd (A,), actions (B, A) -> (B,)."""
     z = (actions - mean) * torch.exp(-logstd)
-    return -0.5 * (z * z).sum(-1) - (logstd.sum() + 0.5 * math.log(2 * math.pi) * logstd.numel())
+    return -torch.addcmul(logstd + 0.5 * math.log(2 * math.pi), z, z, value=0.5).sum(-1)
+
+
+def gaussian_entropy(logstd: torch.Tensor) -> torch.Tensor:
+    """Entropy of a diagonal Gaussian, a scalar."""
+    return (logstd + 0.5 * math.log(2 * math.pi * math.e)).sum()
 
 
 def gaussian_kl(mean_p: torch.Tensor, logstd_p: torch.Tensor, mean_q: torch.Tensor, logstd_q: torch.Tensor):
@@ -889,27 +895,35 @@ def ppo_loss(
     ent_coef: float,
     vf_coef: float,
 ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-    """The loss to minimise, and as scalars the policy's loss, the value's, the entropy and the share of clipped ratios.
+    """The loss to minimise, and as scalars the policy's loss and the value function's.
 
     `outputs` are the agent's for the minibatch: mean (M, A), logstd (A,), value (M,).
     """
     mean, logstd, value = outputs
-    advantages = minibatch.advantages
+    advantages, old_value = minibatch.advantages, minibatch.values
     if norm_adv:
-        advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        std, center = torch.std_mean(advantages)
+        advantages = (advantages - center) / (std + 1e-8)
     ratio = torch.exp(gaussian_log_prob(mean, logstd, minibatch.actions) - minibatch.logprobs)  # ρ_t(θ)
     clipped_ratio = ratio.clamp(1 - clip_coef, 1 + clip_coef)
-    pg_loss = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()  # Eq. 4.2.6
+    pg_loss = -torch.min(advantages * ratio, advantages * clipped_ratio).mean()  # Eq. 4.2.6
 
-    v_error = (value - minibatch.returns) ** 2
+    v_error = value - minibatch.returns
+    v_squared = v_error * v_error  # half the time of a power
     if clip_vloss:  # section 4.3.2, item 5
-        v_clipped = minibatch.values + (value - minibatch.values).clamp(-clip_coef, clip_coef)
-        v_error = torch.max(v_error, (v_clipped - minibatch.returns) ** 2)
-    v_loss = 0.5 * v_error.mean()
+        v_clipped_error = torch.clamp(value, old_value - clip_coef, old_value + clip_coef) - minibatch.returns
+        v_squared = torch.max(v_squared, v_clipped_error * v_clipped_error)
+    v_loss = 0.5 * v_squared.mean()
 
-    entropy = (logstd + 0.5 * math.log(2 * math.pi * math.e)).sum()
-    clipfrac = ((ratio.detach() - 1).abs() > clip_coef).float().mean()
-    return pg_loss - ent_coef * entropy + vf_coef * v_loss, (pg_loss, v_loss, entropy, clipfrac)
+    loss = pg_loss + vf_coef * v_loss
+    if ent_coef:
+        loss = loss - ent_coef * gaussian_entropy(logstd)
+    return loss, (pg_loss, v_loss)
+
+
+def log_ratio(agent: Agent, batch: Batch) -> torch.Tensor:
+    """log ρ_t(θ) = log π_k(a|s) − log π_old(a|s), (B,)."""
+    return gaussian_log_prob(agent.actor_mean(batch.obs), agent.actor_logstd, batch.actions) - batch.logprobs
 
 
 @torch.no_grad()
@@ -918,8 +932,7 @@ def kl_estimates(agent: Agent, batch: Batch, old_logstd: torch.Tensor) -> dict[s
 
     k1 and k3 estimate D_KL(π_old ‖ π_k) from the actions taken; "exact-new-old" is Eq. 4.3.1 in closed form.
     """
-    mean, logstd = agent.actor_mean(batch.obs), agent.actor_logstd
-    logratio = gaussian_log_prob(mean, logstd, batch.actions) - batch.logprobs
+    mean, logstd, logratio = agent.actor_mean(batch.obs), agent.actor_logstd, log_ratio(agent, batch)
     return {
         "k1": -logratio.mean(),
         "k3": (torch.exp(logratio) - 1 - logratio).mean(),
@@ -928,110 +941,110 @@ def kl_estimates(agent: Agent, batch: Batch, old_logstd: torch.Tensor) -> dict[s
     }
 
 
-def make_optimizer(agent: Agent, learning_rate: float, value_learning_rate: float) -> torch.optim.Adam:
-    """One Adam over both networks, with a learning rate for each (Table 4.1) and its moments at zero."""
-    groups = [
-        {"params": agent.policy_parameters(), "lr": learning_rate},
-        {"params": list(agent.critic.parameters()), "lr": value_learning_rate},
-    ]
-    optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
-    for parameter in agent.parameters():
-        zeros = {"exp_avg": torch.zeros_like(parameter), "exp_avg_sq": torch.zeros_like(parameter)}
-        optimizer.state[parameter] = {"step": torch.zeros((), device=parameter.device), **zeros}
-    return optimizer
+def views(vector: torch.Tensor, shapes: list[torch.Size]) -> list[torch.Tensor]:
+    """Cut a vector into tensors of the given shapes, without a copy."""
+    parts = vector.split([shape.numel() for shape in shapes])
+    return [part.view(shape) for part, shape in zip(parts, shapes)]
+
+
+class FlatAdam:
+    """Adam over one vector, of which the agent's parameters become views: the policy's first, then the value function's.
+
+    One vector is clipped and stepped faster than a dozen tensors, and a slice of it is what KLE-Rollback restores.
+    """
+
+    def __init__(self, agent: Agent, learning_rate: float, value_learning_rate: float):
+        self.parameters = [*agent.policy_parameters(), *agent.critic.parameters()]
+        self.shapes = [parameter.shape for parameter in self.parameters]
+        self.vector = torch.cat([parameter.detach().reshape(-1) for parameter in self.parameters])
+        self.gradient, self.mean, self.square = (torch.zeros_like(self.vector) for _ in range(3))
+        for i, value in enumerate(views(self.vector, self.shapes)):
+            self.parameters[i].data = value
+        for i, gradient in enumerate(views(self.gradient, self.shapes)):
+            self.parameters[i].grad = gradient
+        self.step = torch.zeros((), device=self.vector.device)
+        self.policy = slice(0, sum(parameter.numel() for parameter in agent.policy_parameters()))
+        self.initial_rates = torch.full_like(self.vector, value_learning_rate)  # Table 4.1: α_v and α_π
+        self.initial_rates[self.policy] = learning_rate
+        self.rates = self.initial_rates.clone()
+
+    def anneal(self, remaining: float) -> None:
+        """Set the learning rates to a share of the initial ones (section 4.3.2, item 6)."""
+        self.rates.copy_(self.initial_rates * remaining)
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return {"mean": self.mean, "square": self.square, "step": self.step}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        for name, tensor in self.state_dict().items():
+            tensor.copy_(state[name])
+
+
+def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float) -> None:
+    """Clip the gradient's norm (section 4.3.2, item 8) and take one step of Adam; changes the first four in place.
+
+    All are of shape (P,) but `step`, which counts and is a scalar.
+    """
+    gradient = gradient * (max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0)
+    step.add_(1)
+    mean.lerp_(gradient, 1 - 0.9)
+    square.mul_(0.999).addcmul_(gradient, gradient, value=1 - 0.999)
+    denominator = (square / (1 - 0.999**step)).sqrt_().add_(1e-5)
+    vector.sub_(rates * (mean / (1 - 0.9**step)) / denominator)
 
 
 class PlainUpdate:
     """One step of Adam on one minibatch (Algorithm 4.1, line 7)."""
 
-    def __init__(self, agent: Agent, optimizer: torch.optim.Adam, loss_function, max_grad_norm: float):
-        self.agent, self.optimizer, self.loss_function = agent, optimizer, loss_function
-        self.parameters, self.max_grad_norm = list(agent.parameters()), max_grad_norm
+    def __init__(self, agent: Agent, optimizer: FlatAdam, loss_function, max_grad_norm: float):
+        self.agent, self.optimizer = agent, optimizer
+        self.loss_function, self.max_grad_norm = loss_function, max_grad_norm
 
     def __call__(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Change the agent and the optimiser by a packed minibatch; return the parts of the loss before the step."""
         minibatch = Batch.unpack(rows, len(self.agent.actor_logstd))
         loss, parts = self.loss_function(self.agent(minibatch.obs), minibatch)
-        self.optimizer.zero_grad()
+        adam = self.optimizer
+        adam.gradient.zero_()
         loss.backward()
-        nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)  # section 4.3.2, item 8
-        self.optimizer.step()
+        with torch.no_grad():
+            adam_step(adam.vector, adam.mean, adam.square, adam.step, adam.rates, adam.gradient, self.max_grad_norm)
         return parts
 
 
-def flatten(tensors: list[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Copy tensors into one vector; return it and views of it in their shapes."""
-    vector = torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
-    parts = vector.split([tensor.numel() for tensor in tensors])
-    return vector, [part.view(tensor.shape) for part, tensor in zip(parts, tensors)]
+class CompiledUpdate(PlainUpdate):
+    """The same step, gradient included, as one compiled graph."""
 
-
-class CompiledUpdate:
-    """The same step as one compiled graph over two flat vectors: the parameters of the policy and of the value function.
-
-    The agent's parameters and the optimiser's moments become views of flat vectors, so that all else goes on as before:
-    the agent can be read and restored at any time, and checkpoints are the same.
-    """
-
-    def __init__(self, agent: Agent, optimizer: torch.optim.Adam, loss_function, max_grad_norm: float, batch_rows: int):
-        self.agent, self.optimizer = agent, optimizer
-        self.loss_function, self.max_grad_norm = loss_function, max_grad_norm
-        groups = [group["params"] for group in optimizer.param_groups]
-        states = [[optimizer.state[parameter] for parameter in group] for group in groups]
-        values = [flatten(group) for group in groups]
-        means = [flatten([state["exp_avg"] for state in group]) for group in states]
-        squares = [flatten([state["exp_avg_sq"] for state in group]) for group in states]
-        steps = [group[0]["step"].clone() for group in states]
-        self.variables = [[vector for vector, _ in pair] for pair in (values, means, squares)] + [steps]
-        self.rates = [torch.zeros_like(step) for step in steps]
+    def __init__(self, agent: Agent, optimizer: FlatAdam, loss_function, max_grad_norm: float, batch_rows: int):
+        super().__init__(agent, optimizer, loss_function, max_grad_norm)
         names = {parameter: name for name, parameter in agent.named_parameters()}
-        self.names = [[names[parameter] for parameter in group] for group in groups]
-        self.shapes = [[parameter.shape for parameter in group] for group in groups]
+        self.names = [names[parameter] for parameter in optimizer.parameters]
+        self.variables = (optimizer.vector, optimizer.mean, optimizer.square, optimizer.step)
         self.compiled = torch.compile(self.step)
-
-        width = len(agent.obs_mean) + 2 * len(agent.actor_logstd) + 4
-        copies = [[tensor.clone() for tensor in tensors] for tensors in self.variables]
+        example = optimizer.vector.new_zeros(batch_rows, len(agent.obs_mean) + 2 * len(agent.actor_logstd) + 4)
         torch.compiler.set_stance("default")
-        with torch.no_grad():  # compiles; the vectors are adopted only when that went well
-            self.compiled(*copies, self.rates, steps[0].new_zeros(batch_rows, width))
+        with torch.no_grad():  # compiles, and changes nothing but copies
+            self.compiled(*(tensor.clone() for tensor in self.variables), optimizer.rates, example)
         torch.compiler.set_stance("default", skip_guard_eval_unsafe=True)  # every call is alike: saves 30 µs of each
-        for i, group in enumerate(groups):
-            for parameter, value, mean, square in zip(group, values[i][1], means[i][1], squares[i][1]):
-                parameter.data = value
-                optimizer.state[parameter] = {"step": steps[i], "exp_avg": mean, "exp_avg_sq": square}
 
-    def loss(self, vectors: list[torch.Tensor], rows: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-        """The loss as a function of the flat parameters."""
-        parameters = {}
-        for vector, names, shapes in zip(vectors, self.names, self.shapes):
-            parts = vector.split([shape.numel() for shape in shapes])
-            parameters |= {name: part.view(shape) for name, part, shape in zip(names, parts, shapes)}
+    def loss(self, vector: torch.Tensor, rows: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        """The loss as a function of the vector of parameters."""
+        parameters = dict(zip(self.names, views(vector, self.optimizer.shapes)))
         minibatch = Batch.unpack(rows, len(self.agent.actor_logstd))
         return self.loss_function(torch.func.functional_call(self.agent, parameters, (minibatch.obs,)), minibatch)
 
-    def step(self, vectors, means, squares, steps, rates, rows) -> tuple[torch.Tensor, ...]:
-        """Gradient, clipping and Adam: what PlainUpdate asks of torch, written out; changes its first four arguments."""
-        gradients, parts = torch.func.grad(self.loss, has_aux=True)(vectors, rows)
-        norm = torch.sqrt(sum((gradient * gradient).sum() for gradient in gradients))
-        scale = (self.max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
-        for vector, mean, square, step, rate, gradient in zip(vectors, means, squares, steps, rates, gradients):
-            gradient = gradient * scale
-            step.add_(1)
-            mean.lerp_(gradient, 1 - 0.9)
-            square.mul_(0.999).addcmul_(gradient, gradient, value=1 - 0.999)
-            denominator = (square / (1 - 0.999**step)).sqrt() + 1e-5
-            vector.sub_(rate * (mean / (1 - 0.9**step)) / denominator)
+    def step(self, vector, mean, square, step, rates, rows) -> tuple[torch.Tensor, ...]:
+        gradient, parts = torch.func.grad(self.loss, has_aux=True)(vector, rows)
+        adam_step(vector, mean, square, step, rates, gradient, self.max_grad_norm)
         return parts
 
     def __call__(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Change the agent and the optimiser by a packed minibatch; return the parts of the loss before the step."""
-        for rate, group in zip(self.rates, self.optimizer.param_groups):
-            rate.fill_(group["lr"])
         with torch.no_grad():
-            return self.compiled(*self.variables, self.rates, rows)
+            return self.compiled(*self.variables, self.optimizer.rates, rows)
 
 
-def make_update(agent: Agent, optimizer: torch.optim.Adam, args: Args) -> PlainUpdate | CompiledUpdate:
+def make_update(agent: Agent, optimizer: FlatAdam, args: Args) -> PlainUpdate | CompiledUpdate:
     """The compiled step with `--compile` where a compiler is at hand, else the plain one."""
     loss_function = functools.partial(
         ppo_loss,
@@ -1051,29 +1064,28 @@ def make_update(agent: Agent, optimizer: torch.optim.Adam, args: Args) -> PlainU
     try:
         return CompiledUpdate(agent, optimizer, loss_function, args.max_grad_norm, args.minibatch_size)
     except Exception as error:  # whatever the compiler's tool chain lacks, the plain step needs none of it
-        print(f"--compile: failed ({str(error).splitlines()[0]}), goes on without", file=sys.stderr)
+        print(f"--compile: failed ({first_line(error)}), goes on without", file=sys.stderr)
         return plain
 
 
-def restorable(agent: Agent, optimizer: torch.optim.Adam, scope: str) -> list[torch.Tensor]:
-    """The tensors that KLE-Rollback restores (`--rollback`)."""
-    policy = agent.policy_parameters()
-    tensors = [parameter.data for parameter in policy]
-    if scope == "policy-value":
-        tensors += [parameter.data for parameter in agent.critic.parameters()]
-    if scope == "policy-moments":
-        tensors += [value for parameter in policy for value in optimizer.state[parameter].values()]
-    return tensors
+def restorable(optimizer: FlatAdam, scope: str) -> list[torch.Tensor]:
+    """The tensors that KLE-Rollback restores (`--rollback`), as views."""
+    policy = optimizer.policy
+    return {
+        "policy": [optimizer.vector[policy]],
+        "policy-value": [optimizer.vector],
+        "policy-moments": [optimizer.vector[policy], optimizer.mean[policy], optimizer.square[policy]],
+    }[scope]
 
 
-def update_policy(agent: Agent, optimizer: torch.optim.Adam, update, batch: Batch, args: Args) -> dict[str, float]:
+def update_policy(agent: Agent, optimizer: FlatAdam, update, batch: Batch, args: Args) -> dict[str, float]:
     """Algorithm 4.1, lines 4 to 15: up to K update iterations, ended early by the KL divergence.
 
     Returns the metrics of the update; `charts/update_iterations` counts from 1, a rolled-back iteration included.
     """
     old_logstd = agent.actor_logstd.detach().clone()  # line 4
     rows = batch.pack()
-    tensors = restorable(agent, optimizer, args.rollback)
+    tensors = restorable(optimizer, args.rollback)
     early_stopping = args.kle_stop or args.kle_rollback
     rolled_back = False
     for k in range(1, args.update_epochs + 1):  # line 5
@@ -1085,7 +1097,7 @@ def update_policy(agent: Agent, optimizer: torch.optim.Adam, update, batch: Batc
             update(minibatch)  # line 7
         if measured and args.kl_timing == "before-last-step":
             kl = kl_estimates(agent, samples, old_logstd)[args.kl_estimator].item()
-        pg_loss, v_loss, entropy, clipfrac = update(last)
+        pg_loss, v_loss = update(last)
         if measured and args.kl_timing == "after-iteration":
             kl = kl_estimates(agent, samples, old_logstd)[args.kl_estimator].item()  # line 9
         if early_stopping and kl > args.d_target:  # line 10
@@ -1096,14 +1108,17 @@ def update_policy(agent: Agent, optimizer: torch.optim.Adam, update, batch: Batc
             break  # lines 11 and 12
 
     moved = kl_estimates(agent, batch, old_logstd)
+    with torch.no_grad():
+        clipped = (log_ratio(agent, batch).exp() - 1).abs() > args.clip_coef
+        entropy = gaussian_entropy(agent.actor_logstd)
     return {
-        "charts/learning_rate": optimizer.param_groups[0]["lr"],
+        "charts/learning_rate": optimizer.rates[0].item(),
         "charts/update_iterations": k,
         "charts/rolled_back": int(rolled_back),
         "losses/policy_loss": pg_loss.item(),
         "losses/value_loss": v_loss.item(),
         "losses/entropy": entropy.item(),
-        "losses/clipfrac": clipfrac.item(),
+        "losses/clipfrac": clipped.float().mean().item(),
         "losses/approx_kl": kl,
         "losses/kl_k1": moved["k1"].item(),
         "losses/kl_k3": moved["k3"].item(),
@@ -1117,40 +1132,47 @@ def update_policy(agent: Agent, optimizer: torch.optim.Adam, update, batch: Batc
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "ppo_continuous_kle 1"
-FREE_ON_RESUME = {
-    "run_dir", "resume", "stop_at", "checkpoint_interval", "track", "wandb_project_name", "wandb_entity",
-    "capture_video", "save_model", "save_demos", "eval_episodes", "eval_mode",
-}  # fmt: skip
+FINISH = ("eval_episodes", "eval_mode", "capture_video", "save_model", "save_demos")
+FREE_ON_RESUME = [
+    "run_dir",
+    "resume",
+    "stop_at",
+    "checkpoint_interval",
+    "track",
+    "wandb_project_name",
+    "wandb_entity",
+] + [*FINISH]
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file so that after a crash it is there whole or not at all."""
+def write_whole(path: Path, content: bytes, keep_old_as: str | None = None) -> None:
+    """Write a file so that after a crash it is there whole or not at all; on request keep the one that it replaces."""
     temporary = path.with_name(path.name + ".tmp")
     with open(temporary, "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
+    if keep_old_as is not None and path.exists():
+        os.replace(path, path.with_name(keep_old_as))
     os.replace(temporary, path)
-    sync_folder(path.parent)
+    folder = os.open(path.parent, os.O_RDONLY)
+    os.fsync(folder)
+    os.close(folder)
 
 
 def write_json(path: Path, content: dict) -> None:
-    write_whole(path, (json.dumps(content, indent=2, default=str) + "\n").encode())
+    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
-def sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    os.fsync(descriptor)
-    os.close(descriptor)
+def arguments(args: Args) -> dict:
+    """The arguments as JSON knows them: paths and infinity as strings, tuples as lists."""
+    return json.loads(json.dumps(asdict(args), default=str).replace("Infinity", '"inf"'))
 
 
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
     torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
-    if (run_dir / "checkpoint.pt").exists():
-        os.replace(run_dir / "checkpoint.pt", run_dir / "checkpoint.previous.pt")
-    write_whole(run_dir / "checkpoint.pt", content.getvalue())
+    write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
 def read_checkpoint(path: Path) -> dict | None:
@@ -1167,65 +1189,75 @@ def read_checkpoint(path: Path) -> dict | None:
 
 def load_checkpoint(run_dir: Path) -> dict | None:
     """The newest whole checkpoint; None where there is no file. Raises UsageError where no file is whole."""
-    paths = [run_dir / name for name in ("checkpoint.pt", "checkpoint.previous.pt")]
-    paths = [path for path in paths if path.exists()]
-    for path in paths:
-        state = read_checkpoint(path)
-        if state is not None:
-            return state
-        print(f"{path}: torn or no checkpoint of this script", file=sys.stderr)
-    if paths:
-        raise UsageError(f"--resume {run_dir}: holds no whole checkpoint of this script; nothing was changed")
-    return None
+    paths = [run_dir / name for name in ("checkpoint.pt", "checkpoint.previous.pt") if (run_dir / name).exists()]
+    states = [read_checkpoint(path) for path in paths]
+    whole = [state for state in states if state is not None]
+    require(bool(whole) or not paths, "--resume", run_dir, "holds no whole checkpoint of this script")
+    if whole and states[0] is None:
+        print(f"{paths[0]}: torn, goes on from the one before", file=sys.stderr)
+        paths[0].unlink()  # or the next checkpoint would push out the whole one
+    return whole[0] if whole else None
 
 
-def check_same_run(args: Args, run_dir: Path) -> None:
-    """Raise UsageError unless `args.json` in the folder has the values of every argument that the results depend on."""
-    try:
-        saved = json.loads((run_dir / "args.json").read_text())
-    except (OSError, ValueError):
-        raise UsageError(f"--resume: {run_dir} is no run of this script, it has no args.json") from None
-    current = json.loads(json.dumps(asdict(args), default=str))
+def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
+    """Raise UsageError unless the saved arguments agree with all that the results depend on."""
+    current = arguments(args)
     changed = [name for name in current if name not in FREE_ON_RESUME and current[name] != saved.get(name)]
     differences = [f"--{name.replace('_', '-')} {current[name]} (was {saved.get(name)})" for name in changed]
     require(not changed, "--resume", ", ".join(differences), f"must be as in {run_dir}")
 
 
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
-    """Create the run's folder with its `args.json`, or with `--resume` go on in it; return it and its checkpoint.
+    """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then has changed nothing.
+    The folder stays locked while the process lives. Raises UsageError, and then has created nothing.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
     try:
-        if run_dir.exists() and any(path.suffix != ".tmp" for path in run_dir.iterdir()):
-            require(args.resume, "--run-dir", run_dir, "exists; give --resume to go on in it, or another folder")
-            check_same_run(args, run_dir)
-            checkpoint = load_checkpoint(run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        write_json(run_dir / "args.json", asdict(args))
+        if all(path.suffix == ".tmp" for path in run_dir.iterdir()):
+            write_json(run_dir / "args.json", arguments(args))
+            return run_dir, None
+        require(args.resume, "--run-dir", run_dir, "exists; give --resume to go on in it, or another folder")
+        check_same_run(args, json.loads((run_dir / "args.json").read_text()), run_dir)
+        checkpoint = load_checkpoint(run_dir)
     except BlockingIOError:
         raise UsageError(f"--run-dir {run_dir}: another process is running in it") from None
+    except (FileNotFoundError, ValueError):
+        raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
     except OSError as error:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
+    if checkpoint is not None:
+        check_same_run(args, checkpoint["args"], run_dir)
     return run_dir, checkpoint
+
+
+def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
+    """Whether `result.json` says that the run has come to `last_step` and was evaluated as asked for."""
+    if not (run_dir / "result.json").exists():
+        return False
+    result, wanted = json.loads((run_dir / "result.json").read_text()), arguments(args)
+    return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
 
 
 class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
-    def __init__(self, path: Path, offset: int):
-        self.file = open(path, "a", newline="")  # noqa: SIM115
-        self.file.truncate(offset)
-        self.writer = csv.writer(self.file, lineterminator="\n")
-        self.columns: list[str] = []
+    def __init__(self, path: Path, length: int):
+        self.file = open(path, "a", newline="", buffering=1)  # noqa: SIM115
+        if path.stat().st_size < length:
+            raise RunError(f"{path}: shorter than at the last checkpoint; it cannot be gone on with")
+        self.file.truncate(length)
+        self.file.seek(0, os.SEEK_END)
+        self.writer, self.has_header = csv.writer(self.file, lineterminator="\n"), length > 0
 
     def write(self, row: dict) -> None:
         """Append a row, after the header where the file is empty."""
-        if self.file.tell() == 0:
+        if not self.has_header:
             self.writer.writerow(row)
+            self.has_header = True
         self.writer.writerow(row.values())
 
     def sync(self) -> int:
@@ -1236,27 +1268,36 @@ class CsvLog:
 
 
 class StopSignal:
-    """SIGINT, SIGTERM and SIGUSR1 ask for a checkpoint and an end after the current iteration; a second one ends at once."""
+    """SIGINT, SIGTERM and SIGUSR1 ask for a checkpoint and an end after the current iteration; a second ends at once."""
+
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
 
     def __init__(self):
         self.received = 0
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
+        for number in self.numbers:
             signal.signal(number, self.receive)
 
     def receive(self, number: int, frame) -> None:
         self.received = number
-        signal.signal(number, signal.SIG_DFL)
+        self.release()
+
+    def release(self) -> None:
+        for number in self.numbers:
+            signal.signal(number, signal.SIG_DFL)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Evaluation
 # ---------------------------------------------------------------------------------------------------------------------
+MAX_EVALUATION_STEPS = 100_000  # of an episode, where the environment has no time limit
+
+
 def play(agent: Agent, env: gym.Env, args: Args, seed: int) -> dict[str, np.ndarray]:
-    """One episode with frozen statistics: raw observations (T + 1, O), actions (T, A), rewards (T,) and how it ended."""
+    """One episode with frozen statistics: raw observations (T + 1, ...), actions (T, ...), rewards (T,), how it ended."""
     policy, std = numpy_policy(agent), agent.actor_logstd.detach().exp().cpu().numpy()
     mean, divisor = agent.obs_mean.cpu().numpy(), agent.obs_divisor.cpu().numpy()
     low, high = np.ravel(env.action_space.low), np.ravel(env.action_space.high)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng([seed, 1])  # [seed] alone would be the environment's own stream
     obs, _ = env.reset(seed=seed)
     observations, actions, rewards = [obs], [], []
     terminated = truncated = False
@@ -1272,6 +1313,7 @@ def play(agent: Agent, env: gym.Env, args: Args, seed: int) -> dict[str, np.ndar
         observations.append(obs)
         actions.append(action)
         rewards.append(reward)
+        truncated = truncated or len(rewards) == MAX_EVALUATION_STEPS
     return {
         "observations": np.array(observations),
         "actions": np.array(actions),
@@ -1290,7 +1332,7 @@ def check_video(env_id: str) -> None:
         env.render()
         env.close()
     except Exception as error:  # each renderer has its own
-        raise UsageError(f"--capture-video: cannot draw {env_id} here: {str(error).splitlines()[0]}") from None
+        raise UsageError(f"--capture-video: cannot draw {env_id} here: {first_line(error)}") from None
 
 
 def evaluate(agent: Agent, args: Args, run_dir: Path) -> dict:
@@ -1304,7 +1346,6 @@ def evaluate(agent: Agent, args: Args, run_dir: Path) -> dict:
     evaluation = {
         "env_id": args.env_id,
         "mode": args.eval_mode,
-        "episodes": len(returns),
         **summary(returns),
         "returns": returns,
         "seeds": seeds,
@@ -1313,22 +1354,23 @@ def evaluate(agent: Agent, args: Args, run_dir: Path) -> dict:
     return evaluation
 
 
-def summary(returns: list[float]) -> dict[str, float]:
-    """Mean, standard deviation, minimum and maximum of episode returns; NaN where there are none."""
-    values = np.array(returns) if len(returns) else np.array([np.nan])
-    return {"mean": values.mean(), "std": values.std(), "min": values.min(), "max": values.max()}
+def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
+    """Number, mean, standard deviation, minimum and maximum of episode returns; None where there are none."""
+    functions = {"mean": np.mean, "std": np.std, "min": np.min, "max": np.max}
+    numbers = {name: float(function(returns)) if len(returns) else None for name, function in functions.items()}
+    return {"episodes": len(returns), **numbers}
 
 
 def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
     """Write `--save-demos` episodes as `demos/episode_*.npz`, and a manifest with their checksums.
 
     Each file has observations (T + 1, ...), actions (T, ...), rewards (T,), terminated, truncated, seed, and t_ns (T,),
-    the time of each action in nanoseconds of the environment's own clock.
+    the time of each action in nanoseconds, simulated where the environment says how long a step is.
     """
     folder = run_dir / "demos"
     folder.mkdir(exist_ok=True)
     env = make_env(args.env_id)
-    step_ns = round(1e9 / env.metadata.get("render_fps", 1))
+    step_ns = round(1e9 * getattr(env.unwrapped, "dt", 1 / env.metadata.get("render_fps", 1)))
     manifest = {"version": 1, "env_id": args.env_id, "player": args.exp_name, "mode": args.eval_mode, "files": {}}
     for i in range(args.save_demos):
         episode = play(agent, env, args, episode_seed(args.seed, DEMONSTRATION_STREAM, i))
@@ -1376,10 +1418,10 @@ def plot_learning_curve(run_dir: Path, args: Args, evaluation: dict) -> None:
 
 def print_table(result: dict) -> None:
     """Print the last episodes of training and the evaluation, one line each."""
-    print(f"{'':32}{'episodes':>9}{'mean':>11}{'std':>10}{'min':>11}{'max':>11}")
+    print(f"{'':32}{'episodes':>9}{'mean':>11}{'std':>11}{'min':>11}{'max':>11}")
     for name in ("training", "evaluation"):
         row = result[name]
-        numbers = f"{row['mean']:>11.1f}{row['std']:>10.1f}{row['min']:>11.1f}{row['max']:>11.1f}"
+        numbers = "".join(f"{row[key]:>11.1f}" for key in ("mean", "std", "min", "max") if row[key] is not None)
         print(f"{name + ' (' + row['mode'] + ')':32}{row['episodes']:>9}{numbers}")
 
 
@@ -1400,15 +1442,7 @@ def start_wandb(args: Args, run_dir: Path) -> None:
         dir=run_dir,
         id=run_id,
         resume="allow",
-        save_code=True,
     )
-
-
-def choose_device(cuda: bool) -> torch.device:
-    """The GPU with `--cuda` where there is one; says so where there is none."""
-    if cuda and not torch.cuda.is_available():
-        print("--cuda: no GPU here, goes on with the CPU", file=sys.stderr)
-    return torch.device("cuda" if cuda and torch.cuda.is_available() else "cpu")
 
 
 def main(args: Args) -> int:
@@ -1419,23 +1453,28 @@ def main(args: Args) -> int:
         check_video(args.env_id)
     run_dir, checkpoint = open_run_dir(args)
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / args.batch_size))
-    if (run_dir / "result.json").exists() and checkpoint and checkpoint["iteration"] >= last_iteration:
+    if is_done(run_dir, args, last_iteration * args.batch_size):
         print(f"{run_dir} is done")
         return 0
+    done_without = checkpoint is None and (run_dir / "result.json").exists()
+    require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
+    write_json(run_dir / "args.json", arguments(args))
     (run_dir / "result.json").unlink(missing_ok=True)
-    print(f"{run_dir}")
+    print(run_dir)
 
-    random.seed(args.seed)
+    random.seed(args.seed)  # this file draws from neither; for environments that do
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(args.num_threads)
-    device = choose_device(args.cuda)
+    if args.cuda and not torch.cuda.is_available():
+        print("--cuda: no GPU here, goes on with the CPU", file=sys.stderr)
+    device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     stop = StopSignal()
 
     collector = Collector(envs, args)
     agent = Agent(collector.obs_dim, collector.action_dim, args.activation, args.ortho_init, args.init_gains).to(device)
-    optimizer = make_optimizer(agent, args.learning_rate, args.value_learning_rate)
+    optimizer = FlatAdam(agent, args.learning_rate, args.value_learning_rate)
     iteration, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}
     if checkpoint is None:
         collector.start()
@@ -1450,6 +1489,9 @@ def main(args: Args) -> int:
                 "--resume: the replayed episode differs (other machine or versions?); goes on with it", file=sys.stderr
             )
     update = make_update(agent, optimizer, args)
+    arithmetic = f"{type(update).__name__} on {device.type}"
+    if checkpoint and checkpoint["arithmetic"] != arithmetic:
+        print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     global_step = iteration * args.batch_size
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
@@ -1462,9 +1504,7 @@ def main(args: Args) -> int:
     while iteration < last_iteration:  # Algorithm 4.1, line 1
         iteration += 1
         if args.anneal_lr:
-            remaining = 1.0 - (iteration - 1) / args.num_iterations
-            optimizer.param_groups[0]["lr"] = remaining * args.learning_rate
-            optimizer.param_groups[1]["lr"] = remaining * args.value_learning_rate
+            optimizer.anneal(1.0 - (iteration - 1) / args.num_iterations)
 
         rollout = collector.collect(agent)  # lines 2 and 3
         batch = make_batch(agent, rollout, args, device)
@@ -1491,6 +1531,8 @@ def main(args: Args) -> int:
         crossed = global_step // args.checkpoint_interval > (global_step - args.batch_size) // args.checkpoint_interval
         if crossed or stop.received or iteration == last_iteration:
             state = {
+                "args": arguments(args),
+                "arithmetic": arithmetic,
                 "iteration": iteration,
                 "training_seconds": training_seconds,
                 "offsets": {"episodes": episodes_csv.sync(), "updates": updates_csv.sync()},
@@ -1499,41 +1541,47 @@ def main(args: Args) -> int:
                 "torch_rng": torch.get_rng_state(),
                 "collector": collector.state_dict(),
             }
+            writer.flush()
             save_checkpoint(run_dir, state)
         if stop.received and iteration < last_iteration:
             progress.close()
+            writer.close()
             print(f"stopped by signal {stop.received} at step {global_step}; go on with --run-dir {run_dir} --resume")
             return 128 + stop.received
 
     progress.close()
+    stop.release()
+    finish_run(agent, args, run_dir, global_step, training_seconds, writer)
     writer.close()
-    finish_run(agent, args, run_dir, global_step, training_seconds)
     return 0
 
 
-def finish_run(agent: Agent, args: Args, run_dir: Path, global_step: int, training_seconds: float) -> None:
+def finish_run(
+    agent: Agent, args: Args, run_dir: Path, global_step: int, seconds: float, writer: SummaryWriter
+) -> None:
     """Evaluate, draw, save what was asked for, and write `result.json` last."""
     evaluation = evaluate(agent, args, run_dir)
+    for name in ("mean", "std", "min", "max"):
+        writer.add_scalar(f"eval/episodic_return_{name}", evaluation[name], global_step)
     if args.save_model:
-        write_whole(
-            run_dir / "model.safetensors",
-            safetensors.torch.save(agent.state_dict(), {"args": json.dumps(asdict(args), default=str)}),
-        )
+        model = safetensors.torch.save(agent.state_dict(), {"args": json.dumps(arguments(args))})
+        write_whole(run_dir / "model.safetensors", model)
     if args.save_demos:
         save_demonstrations(agent, args, run_dir)
     plot_learning_curve(run_dir, args, evaluation)
-    returns = read_episodes(run_dir)[:, 1]
+    versions = {module.__name__: module.__version__ for module in (gym, mujoco, np, torch)}
     result = {
         "env_id": args.env_id,
         "seed": args.seed,
         "global_step": global_step,
-        "training": {"mode": "sampled", "episodes": len(returns[-50:]), **summary(returns[-50:])},
-        "evaluation": {k: evaluation[k] for k in ("mode", "episodes", "mean", "std", "min", "max")},
-        "training_seconds": training_seconds,
-        "steps_per_second": global_step / training_seconds,
+        "complete": global_step == args.num_iterations * args.batch_size,
+        "finish": {name: arguments(args)[name] for name in FINISH},
+        "training": {"mode": "sampled", **summary(read_episodes(run_dir)[-50:, 1])},
+        "evaluation": {name: value for name, value in evaluation.items() if name not in ("returns", "seeds")},
+        "training_seconds": seconds,
+        "steps_per_second": global_step / seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "versions": {m.__name__: m.__version__ for m in (gym, mujoco, np, torch)}
-        | {"python": platform.python_version()},
+        "versions": {**versions, "python": platform.python_version()},
     }
     write_json(run_dir / "result.json", result)
     print_table(result)
@@ -1549,7 +1597,7 @@ def cli(argv: list[str] | None = None) -> int:
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
     except OSError as error:
-        print(f"error: {error}; the last checkpoint is whole: send the command again with --resume", file=sys.stderr)
+        print(f"error: {error}; a checkpoint stays whole: go on with --run-dir and --resume", file=sys.stderr)
     return 1
 
 

@@ -20,6 +20,12 @@ B, O, A = 256, 5, 3  # noqa: E741
 CPU = torch.device("cpu")
 
 
+@pytest.fixture(autouse=True)
+def forget_compiled_graphs():
+    """Each test compiles for itself: dynamo keeps eight graphs of a function and then silently runs it plainly."""
+    torch._dynamo.reset()
+
+
 def make_args(**overrides) -> ppo.Args:
     small = {"env_id": "Pendulum-v1", "num_steps": 128, "num_minibatches": 4, "total_timesteps": 1280}
     return ppo.complete_args(ppo.Args(**{**small, **overrides}))
@@ -186,7 +192,7 @@ def test_loss_is_the_one_derived_by_hand(clip_vloss, norm_adv):
     mean, logstd, value = (x.detach() + 0.1 * torch.randn_like(x) for x in agent(batch.obs))
     weights = {"clip_coef": 0.2, "ent_coef": 0.01, "vf_coef": 0.7}
     loss, parts = ppo.ppo_loss((mean, logstd, value), batch, clip_vloss=clip_vloss, norm_adv=norm_adv, **weights)
-    policy_sum = value_sum = clipped = 0.0
+    policy_sum = value_sum = 0.0
     advantages = batch.advantages.double().numpy()
     if norm_adv:
         advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
@@ -194,7 +200,6 @@ def test_loss_is_the_one_derived_by_hand(clip_vloss, norm_adv):
         logprob = Normal(mean[i].double(), logstd.double().exp()).log_prob(batch.actions[i].double()).sum()
         ratio = math.exp(logprob - batch.logprobs[i])
         policy_sum += min(ratio * advantages[i], max(0.8, min(1.2, ratio)) * advantages[i])
-        clipped += ratio < 0.8 or ratio > 1.2
         target, old = batch.returns[i].item(), batch.values[i].item()
         error = (value[i].item() - target) ** 2
         if clip_vloss:
@@ -203,8 +208,7 @@ def test_loss_is_the_one_derived_by_hand(clip_vloss, norm_adv):
     entropy = Normal(mean[0], logstd.exp()).entropy().sum().item()
     assert parts[0].item() == pytest.approx(-policy_sum / B, abs=1e-5)
     assert parts[1].item() == pytest.approx(value_sum / B, rel=1e-4)
-    assert parts[2].item() == pytest.approx(entropy, rel=1e-5)
-    assert parts[3].item() == pytest.approx(clipped / B)
+    assert ppo.gaussian_entropy(logstd).item() == pytest.approx(entropy, rel=1e-5)
     assert loss.item() == pytest.approx(-policy_sum / B - 0.01 * entropy + 0.7 * value_sum / B, rel=1e-4)
 
 
@@ -230,37 +234,45 @@ def test_packed_rows_unpack_to_the_same_batch():
         assert torch.equal(column, unpacked)
 
 
-def update_pair(args: ppo.Args, make_second) -> tuple[ppo.Agent, ppo.Agent]:
-    """Twenty steps of the plain update and of another on the same minibatches, from the same start."""
-    agents = []
-    for make in (ppo.PlainUpdate, make_second):
-        agent = make_agent(args)
-        optimizer = ppo.make_optimizer(agent, 3e-3, 1e-3)
-        loss = functools.partial(
-            ppo.ppo_loss, clip_coef=0.2, clip_vloss=True, norm_adv=True, ent_coef=0.01, vf_coef=0.5
-        )
-        rows = random_batch(agent).pack()
-        update = make(agent, optimizer, loss, args.max_grad_norm)
-        for i in range(20):
-            update(rows[(i % 4) * 64 : (i % 4 + 1) * 64])
-        agents.append(agent)
-    return tuple(agents)
+class ReferenceUpdate:
+    """The step with torch.optim.Adam and clip_grad_norm_ on ordinary parameters."""
+
+    def __init__(self, agent, optimizer, loss_function, max_grad_norm):
+        self.agent, self.loss_function, self.max_grad_norm = agent, loss_function, max_grad_norm
+        critic = list(agent.critic.parameters())
+        groups = [{"params": agent.policy_parameters(), "lr": 3e-3}, {"params": critic, "lr": 1e-3}]
+        self.adam = torch.optim.Adam(groups, eps=1e-5)
+
+    def __call__(self, rows):
+        minibatch = ppo.Batch.unpack(rows, A)
+        loss, _ = self.loss_function(self.agent(minibatch.obs), minibatch)
+        self.adam.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.agent.parameters(), self.max_grad_norm)
+        self.adam.step()
 
 
-def assert_close_agents(left: ppo.Agent, right: ppo.Agent) -> None:
+def after_twenty_steps(make_update, **overrides) -> dict[str, torch.Tensor]:
+    """The parameters after twenty steps on the same minibatches from the same start."""
+    args = make_args(learning_rate=3e-3, value_learning_rate=1e-3, **overrides)
+    agent = make_agent(args)
+    rows = random_batch(agent).pack()
+    optimizer = ppo.FlatAdam(agent, args.learning_rate, args.value_learning_rate)
+    loss = functools.partial(ppo.ppo_loss, clip_coef=0.2, clip_vloss=True, norm_adv=True, ent_coef=0.01, vf_coef=0.5)
+    update = make_update(agent, optimizer, loss, args.max_grad_norm)
+    for i in range(20):
+        update(rows[(i % 4) * 64 : (i % 4 + 1) * 64])
+    return dict(agent.named_parameters())
+
+
+@pytest.mark.parametrize("max_grad_norm", [0.05, 0.5, math.inf])
+def test_flat_optimizer_is_torch_adam(max_grad_norm):
+    ours = after_twenty_steps(ppo.PlainUpdate, max_grad_norm=max_grad_norm)
+    reference = after_twenty_steps(ReferenceUpdate, max_grad_norm=max_grad_norm)
     start = make_agent(make_args())
-    for name, value in left.named_parameters():
-        torch.testing.assert_close(value, right.get_parameter(name), rtol=1e-3, atol=2e-5)
-        assert (value - start.get_parameter(name)).abs().max() > 5e-4, (
-            f"{name} did not move: the test would show nothing"
-        )
-
-
-@pytest.mark.parametrize("max_grad_norm", [0.05, math.inf])
-def test_flat_optimizer_is_torch_adam(monkeypatch, max_grad_norm):
-    monkeypatch.setattr(torch, "compile", lambda function: function)
-    flat = functools.partial(ppo.CompiledUpdate, batch_rows=64)
-    assert_close_agents(*update_pair(make_args(max_grad_norm=max_grad_norm), flat))
+    for name, value in ours.items():
+        torch.testing.assert_close(value, reference[name], rtol=1e-3, atol=2e-5)
+        assert (value - start.get_parameter(name)).abs().max() > 5e-4, f"{name} did not move: this would show nothing"
 
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
@@ -269,16 +281,16 @@ needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a
 @needs_compiler
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 def test_compiled_update_gives_the_plain_numbers(activation):
-    args = make_args(activation=activation)
-    plain, compiled = update_pair(args, functools.partial(ppo.CompiledUpdate, batch_rows=64))
-    for name, value in plain.named_parameters():
-        torch.testing.assert_close(value, compiled.get_parameter(name), rtol=1e-3, atol=2e-5)
+    plain = after_twenty_steps(ppo.PlainUpdate, activation=activation)
+    compiled = after_twenty_steps(functools.partial(ppo.CompiledUpdate, batch_rows=64), activation=activation)
+    for name, value in plain.items():
+        torch.testing.assert_close(value, compiled[name], rtol=1e-3, atol=2e-5)
 
 
 def iterate(args: ppo.Args, wrap=lambda update: update) -> tuple[ppo.Agent, dict]:
     """One iteration of the algorithm on Pendulum; returns the agent and the metrics."""
     agent = make_agent(args, 3, 1)
-    optimizer = ppo.make_optimizer(agent, args.learning_rate, args.value_learning_rate)
+    optimizer = ppo.FlatAdam(agent, args.learning_rate, args.value_learning_rate)
     collector = ppo.Collector([ppo.make_env(args.env_id)], args)
     collector.start()
     batch = ppo.make_batch(agent, collector.collect(agent), args, CPU)
@@ -320,27 +332,48 @@ def test_every_flag_changes_the_training(flags):
     assert any(not torch.equal(p, q) for p, q in zip(default.parameters(), changed.parameters()))
 
 
-@pytest.mark.parametrize("mode", ["kle_stop", "kle_rollback"])
-@pytest.mark.parametrize("crossing", [1, 3, 7, None])
-@pytest.mark.parametrize("timing", ["before-last-step", "after-iteration"])
-def test_early_stopping_ends_at_the_first_crossing(monkeypatch, mode, crossing, timing):
-    """Also where the divergence falls below the threshold again, and never after more than K iterations."""
-    values = [0.01 if k != crossing else 0.04 for k in range(1, 8)]
-    measured, steps = [], []
+def script_divergence(monkeypatch, values: list[float], estimator: str = "k1") -> list[int]:
+    """Let the measured divergence be `values`, under one estimator's name; returns the list that counts its samples."""
+    samples = []
 
     def scripted(agent, batch, old_logstd):
-        value = torch.tensor(values[len(measured)] if len(measured) < len(values) else 0.0)
-        measured.append(value.item())
-        return dict.fromkeys(("k1", "k3", "exact-old-new", "exact-new-old"), value)
+        kl = dict.fromkeys(("k1", "k3", "exact-old-new", "exact-new-old"), torch.tensor(0.0))
+        kl[estimator] = torch.tensor(values[len(samples)] if len(samples) < len(values) else 0.0)
+        samples.append(len(batch.obs))
+        return kl
 
     monkeypatch.setattr(ppo, "kl_estimates", scripted)
-    args = make_args(update_epochs=7, kl_timing=timing, **{mode: True})
+    return samples
+
+
+@pytest.mark.parametrize("mode", ["kle_stop", "kle_rollback"])
+@pytest.mark.parametrize("crossing", [1, 3, 7, None])
+@pytest.mark.parametrize("estimator", ["k1", "k3", "exact-old-new", "exact-new-old"])
+def test_early_stopping_ends_at_the_first_crossing(monkeypatch, mode, crossing, estimator):
+    """Also where the divergence falls below the threshold again, and never after more than K iterations."""
+    samples = script_divergence(monkeypatch, [0.01 if k != crossing else 0.04 for k in range(1, 8)], estimator)
+    steps = []
+    args = make_args(update_epochs=7, kl_estimator=estimator, **{mode: True})
     _, metrics = iterate(args, lambda update: lambda rows: steps.append(1) or update(rows))
     iterations = crossing or 7
     assert metrics["charts/update_iterations"] == iterations
     assert len(steps) == iterations * args.num_minibatches
     assert metrics["charts/rolled_back"] == int(mode == "kle_rollback" and crossing is not None)
-    assert len(measured) == iterations + 1  # one more for the log
+    assert len(samples) == iterations + 1  # one more for the log
+    assert metrics["losses/approx_kl"] == pytest.approx(0.04 if crossing else 0.01)
+
+
+@pytest.mark.parametrize("timing, steps_before", [("before-last-step", 3), ("after-iteration", 4)])
+@pytest.mark.parametrize("samples, size", [("last-minibatch", 32), ("batch", 128)])
+def test_the_divergence_is_measured_when_and_where_it_is_told_to(monkeypatch, timing, steps_before, samples, size):
+    """Four minibatches of 32: before or after the last one's step, on it or on the whole batch."""
+    steps, measured = [], []
+    sizes = script_divergence(monkeypatch, [0.0] * 9)
+    scripted = ppo.kl_estimates
+    monkeypatch.setattr(ppo, "kl_estimates", lambda *given: measured.append(len(steps)) or scripted(*given))
+    args = make_args(update_epochs=2, kle_stop=True, kl_timing=timing, kl_samples=samples)
+    iterate(args, lambda update: lambda rows: steps.append(1) or update(rows))
+    assert measured == [steps_before, 4 + steps_before, 8] and sizes == [size, size, 128]
 
 
 def test_without_early_stopping_all_k_iterations_run():
@@ -353,44 +386,51 @@ def test_without_early_stopping_all_k_iterations_run():
 @pytest.mark.parametrize("crossing", [1, 3])
 def test_rollback_restores_bit_for_bit(monkeypatch, scope, compiled, crossing):
     args = make_args(kle_rollback=True, rollback=scope, update_epochs=5, compile=compiled)
-    measured, calls, before = [], [], {}
+    calls, before, after = [], {}, {}
+    script_divergence(monkeypatch, [float(k == crossing) for k in range(1, 6)])
 
-    def scripted(agent, batch, old_logstd):
-        measured.append(0)
-        return dict.fromkeys(
-            ("k1", "k3", "exact-old-new", "exact-new-old"), torch.tensor(float(len(measured) == crossing))
-        )
+    def everything(update) -> dict[str, torch.Tensor]:
+        adam = update.optimizer
+        value = slice(adam.policy.stop, None)
+        moments = {"mean of policy": adam.mean[adam.policy], "square of policy": adam.square[adam.policy]}
+        moments |= {"mean of value": adam.mean[value], "square of value": adam.square[value]}
+        return {name: tensor.detach().clone() for name, tensor in [*update.agent.named_parameters(), *moments.items()]}
 
     def snapshot(update):
         def wrapped(rows):
             if len(calls) == (crossing - 1) * args.num_minibatches:
-                for name, value in update.agent.named_parameters():
-                    moments = {k: v.clone() for k, v in update.optimizer.state[value].items()}
-                    before[name] = (value.detach().clone(), moments)
+                before.update(everything(update))
             calls.append(1)
-            parts = update(rows)
-            after["optimizer"] = update.optimizer
-            return parts
+            after["update"] = update
+            return update(rows)
 
         return wrapped
 
-    after = {}
-    monkeypatch.setattr(ppo, "kl_estimates", scripted)
-    agent, metrics = iterate(args, snapshot)
+    _, metrics = iterate(args, snapshot)
     assert metrics["charts/rolled_back"] == 1 and metrics["charts/update_iterations"] == crossing
-    for name, value in agent.named_parameters():
-        old, old_moments = before[name]
-        is_policy = name.startswith("actor")
-        restored = is_policy or scope == "policy-value"
-        assert torch.equal(value, old) == restored, name
-        for key, moment in after["optimizer"].state[value].items():
-            assert torch.equal(moment, old_moments[key]) == (is_policy and scope == "policy-moments"), (name, key)
+    for name, value in everything(after["update"]).items():
+        restored = {
+            "policy": name.startswith("actor"),
+            "policy-value": name.startswith(("actor", "critic")),
+            "policy-moments": name.startswith("actor") or name.endswith("of policy"),
+        }[scope]
+        assert torch.equal(value, before[name]) == restored, name
 
 
-def test_learning_rates_anneal_to_zero_and_are_two():
-    args = make_args(learning_rate=1e-3, value_learning_rate=2e-3)
-    optimizer = ppo.make_optimizer(make_agent(args), args.learning_rate, args.value_learning_rate)
-    assert [group["lr"] for group in optimizer.param_groups] == [1e-3, 2e-3]
+def docstring_setting(name: str) -> ppo.Args:
+    """The flags that the file's docstring gives for a setting, parsed."""
+    (row,) = (line for line in ppo.__doc__.splitlines() if line.startswith(f"| {name}"))
+    return ppo.complete_args(ppo.parse_args(row.split("|")[2].strip().strip("`").split()))
+
+
+def test_docstring_settings_are_those_of_the_sheet():
+    printed, modern = docstring_setting("as printed"), docstring_setting("modern")
+    assert (printed.gae_lambda, printed.ent_coef, printed.init_gains) == (0.97, 0.2, (1.0, 1.0, 1.0))
+    assert (printed.norm_adv_scope, printed.norm_divisor, printed.rollback) == ("batch", "variance", "policy")
+    assert (printed.kl_estimator, printed.kl_samples) == ("exact-new-old", "last-minibatch")
+    assert modern.kle_rollback and modern.bootstrap_truncated and (modern.update_epochs, modern.d_target) == (80, 0.03)
+    assert (modern.kl_estimator, modern.kl_samples, modern.rollback) == ("exact-old-new", "batch", "policy-moments")
+    assert printed.kl_timing == modern.kl_timing == "after-iteration"
 
 
 def test_settings_that_the_sheet_prints_are_the_defaults():
@@ -407,7 +447,7 @@ def test_gpu_gives_the_numbers_of_the_cpu():
     for device in (CPU, torch.device("cuda")):
         args = make_args()
         agent = make_agent(args, 3, 1).to(device)
-        optimizer = ppo.make_optimizer(agent, 3e-4, 3e-4)
+        optimizer = ppo.FlatAdam(agent, 3e-4, 3e-4)
         collector = ppo.Collector([ppo.make_env("Pendulum-v1")], args)
         collector.start()
         batch = ppo.make_batch(agent, collector.collect(agent), args, device)

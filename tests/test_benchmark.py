@@ -27,12 +27,18 @@ def test_interval_is_that_of_the_t_test():
     assert report.difference_interval(ours, theirs) == pytest.approx((expected.low, expected.high))
 
 
-def fake_run(folder, task: str, seed: int, returns: list[float]) -> None:
+def fake_run(folder, task: str, seed: int, returns: list[float], complete: bool = True) -> None:
     run = folder / f"{task}__seed{seed}"
     run.mkdir(parents=True)
     rows = "".join(f"{1000 * (i + 1)},{value},1000\n" for i, value in enumerate(returns))
     (run / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + rows)
-    result = {"env_id": f"kle/{task}", "seed": seed, "global_step": 1000 * len(returns), "training_seconds": 3600.0}
+    result = {
+        "env_id": f"kle/{task}",
+        "seed": seed,
+        "global_step": 1000 * len(returns),
+        "training_seconds": 3600.0,
+        "complete": complete,
+    }
     (run / "result.json").write_text(json.dumps({**result, "evaluation": {"mean": 1.0}}))
 
 
@@ -42,6 +48,7 @@ def test_report_of_part_of_the_runs(tmp_path):
     for seed, values in returns.items():
         fake_run(tmp_path / "runs", "HalfCheetah-v2", seed, values)
     (tmp_path / "runs" / "HalfCheetah-v2__seed3").mkdir()  # not finished
+    fake_run(tmp_path / "runs", "HalfCheetah-v2", 4, [0.0] * 60, complete=False)  # ended early by --stop-at
     report.ppo_k10(tmp_path / "runs", tmp_path / "out")
     with open(tmp_path / "out" / "runs.csv", newline="") as file:
         rows = list(csv.DictReader(file))

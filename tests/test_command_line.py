@@ -1,5 +1,6 @@
 """What a user can get wrong is one line and exit code 2, and nothing is created."""
 
+import contextlib
 import json
 import shutil
 import subprocess
@@ -237,6 +238,48 @@ def test_no_progress_bar_where_there_is_no_terminal(tmp_path):
     assert "%|" not in done.stderr and "evaluation (greedy)" in done.stdout
 
 
+def test_a_progress_bar_on_a_terminal(tmp_path):
+    import os
+    import pty
+
+    master, slave = pty.openpty()
+    process = subprocess.Popen(command(*SMALL, "--run-dir", "run"), cwd=tmp_path, stdout=slave, stderr=slave)
+    os.close(slave)
+    shown = b""
+    with contextlib.suppress(OSError):  # the terminal closes with the process
+        while part := os.read(master, 4096):
+            shown += part
+    assert process.wait() == 0 and b"step/s" in shown and b"2560/2560" in shown
+
+
+def test_compiled_run_through_the_command_line(small_run, tmp_path):
+    if shutil.which("g++") is None:
+        pytest.skip("needs a C++ compiler")
+    done = run(*SMALL, "--compile", "--save-model", "--stop-at", 512, "--run-dir", "run", cwd=tmp_path)
+    assert "--compile" not in done.stderr
+    plain, compiled = (
+        np.loadtxt(folder / "updates.csv", delimiter=",", skiprows=1, max_rows=2)
+        for folder in (small_run, tmp_path / "run")
+    )
+    np.testing.assert_allclose(compiled, plain, rtol=0.02, atol=2e-3)
+    assert set(safetensors.torch.load_file(tmp_path / "run" / "model.safetensors")) >= {"actor_logstd", "obs_mean"}
+
+
+def test_a_broken_compiler_is_said_and_no_reason_to_stop(tmp_path, small_run):
+    """One that is there but fails."""
+    cache = {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"), "CXX": "false"}
+    done = run(*SMALL, "--compile", "--run-dir", "run", cwd=tmp_path, **cache)
+    assert "--compile: failed" in done.stderr
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+
+
+def test_learning_rate_anneals_to_zero(small_run, tmp_path):
+    rates = np.loadtxt(small_run / "updates.csv", delimiter=",", skiprows=1)[:, 1]
+    np.testing.assert_allclose(rates, 3e-4 * np.linspace(1, 0.1, 10))
+    run(*SMALL, "--no-anneal-lr", "--stop-at", 512, "--run-dir", "run", cwd=tmp_path)
+    assert (np.loadtxt(tmp_path / "run" / "updates.csv", delimiter=",", skiprows=1)[:, 1] == 3e-4).all()
+
+
 def test_video(tmp_path):
     run(*SMALL, "--capture-video", "--run-dir", "run", cwd=tmp_path, SDL_VIDEODRIVER="dummy")
     (video,) = (tmp_path / "run" / "videos").glob("*.mp4")
@@ -258,6 +301,8 @@ def test_tensorboard_has_what_the_csv_has(small_run):
         values = [event.value for event in events.Scalars(name)]
         np.testing.assert_allclose(values, [float(row[column]) for row in rows], rtol=1e-6)
     assert len(events.Scalars("charts/SPS")) == len(rows)
+    evaluation = json.loads((small_run / "evaluation.json").read_text())
+    assert events.Scalars("eval/episodic_return_mean")[0].value == pytest.approx(evaluation["mean"], rel=1e-6)
     assert len(events.Scalars("charts/episodic_return")) == 12
 
 

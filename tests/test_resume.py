@@ -80,6 +80,37 @@ def test_resume_starts_where_there_is_nothing_and_is_done_where_all_is(small_run
     assert (tmp_path / "run" / "result.json").read_bytes() == before
 
 
+def test_a_finished_run_can_be_evaluated_again(small_run, tmp_path):
+    shutil.copytree(small_run, tmp_path / "run")
+    run(*SMALL, "--run-dir", "run", "--resume", "--eval-episodes", 5, "--save-demos", 1, cwd=tmp_path)
+    assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["episodes"] == 5
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+
+
+def test_a_finished_run_without_checkpoints_is_left_alone(small_run, tmp_path):
+    shutil.copytree(small_run, tmp_path / "run")
+    for name in ("checkpoint.pt", "checkpoint.previous.pt"):
+        (tmp_path / "run" / name).unlink()
+    same = ["--save-model", "--save-demos", 2]
+    assert "done" in run(*SMALL, *same, "--run-dir", "run", "--resume", cwd=tmp_path).stdout
+    done = run(*SMALL, *same, "--eval-episodes", 5, "--run-dir", "run", "--resume", cwd=tmp_path, code=2)
+    assert "no checkpoint" in done.stderr
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+
+
+def test_a_torn_checkpoint_does_not_push_out_the_whole_one(small_run, tmp_path):
+    """Killed again, after the resume from the older checkpoint and in the middle of writing the next."""
+    shutil.copytree(small_run, tmp_path / "run")
+    (tmp_path / "run" / "checkpoint.pt").write_bytes(b"torn")
+    (tmp_path / "run" / "result.json").unlink()
+    (tmp_path / "run" / "checkpoint.pt.tmp").mkdir()  # the next checkpoint cannot be written
+    done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path, code=1)
+    assert "checkpoint stays whole" in done.stderr
+    (tmp_path / "run" / "checkpoint.pt.tmp").rmdir()
+    run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert_same_run(small_run, tmp_path / "run")
+
+
 def test_stop_at_ends_early_on_the_full_schedule(small_run, tmp_path):
     run(*SMALL, "--run-dir", "run", "--stop-at", 1000, cwd=tmp_path)
     assert json.loads((tmp_path / "run" / "result.json").read_text())["global_step"] == 1024
@@ -109,6 +140,26 @@ def test_killed_between_the_two_renames_of_a_checkpoint(small_run, tmp_path):
 
 
 def test_killed_before_the_first_checkpoint(small_run, tmp_path):
+    flags = [flag if flag != "1" else "100000" for flag in SMALL]
+    stop_in_the_middle(flags, tmp_path / "run", signal.SIGKILL, 4)
+    assert not (tmp_path / "run" / "checkpoint.pt").exists()
+    run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert_same_run(small_run, tmp_path / "run")
+
+
+def test_stopped_right_after_a_resume(small_run, tmp_path):
+    """A checkpoint before anything was appended remembers the right length of the CSV files."""
+    flags = [flag if flag != "256" else "16" for flag in SMALL]  # an episode spans many iterations
+    run(*flags, "--run-dir", "whole", cwd=tmp_path)
+    folder = tmp_path / "run"
+    stop_in_the_middle(flags, folder, signal.SIGKILL, 30)
+    for _ in range(3):
+        stop_in_the_middle(flags, folder, signal.SIGTERM, rows(folder))
+    run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert_same_run(tmp_path / "whole", folder)
+
+
+def test_killed_while_the_folder_was_made(small_run, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "args.json.tmp").write_text("{")
     run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
