@@ -1112,7 +1112,6 @@ def update_policy(agent: Agent, optimizer: FlatAdam, update, batch: Batch, args:
         clipped = (log_ratio(agent, batch).exp() - 1).abs() > args.clip_coef
         entropy = gaussian_entropy(agent.actor_logstd)
     return {
-        "charts/learning_rate": optimizer.rates[0].item(),
         "charts/update_iterations": k,
         "charts/rolled_back": int(rolled_back),
         "losses/policy_loss": pg_loss.item(),
@@ -1199,6 +1198,14 @@ def load_checkpoint(run_dir: Path) -> dict | None:
     return whole[0] if whole else None
 
 
+def read_arguments(run_dir: Path) -> dict:
+    """The arguments of the run in a folder. Raises UsageError where it is no run."""
+    try:
+        return json.loads((run_dir / "args.json").read_text())
+    except (OSError, ValueError):
+        raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
+
+
 def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
     """Raise UsageError unless the saved arguments agree with all that the results depend on."""
     current = arguments(args)
@@ -1221,12 +1228,10 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
             write_json(run_dir / "args.json", arguments(args))
             return run_dir, None
         require(args.resume, "--run-dir", run_dir, "exists; give --resume to go on in it, or another folder")
-        check_same_run(args, json.loads((run_dir / "args.json").read_text()), run_dir)
+        check_same_run(args, read_arguments(run_dir), run_dir)
         checkpoint = load_checkpoint(run_dir)
     except BlockingIOError:
         raise UsageError(f"--run-dir {run_dir}: another process is running in it") from None
-    except (FileNotFoundError, ValueError):
-        raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
     except OSError as error:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
@@ -1503,12 +1508,13 @@ def main(args: Args) -> int:
 
     while iteration < last_iteration:  # Algorithm 4.1, line 1
         iteration += 1
-        if args.anneal_lr:
-            optimizer.anneal(1.0 - (iteration - 1) / args.num_iterations)
+        remaining = 1.0 - (iteration - 1) / args.num_iterations if args.anneal_lr else 1.0
+        optimizer.anneal(remaining)
 
         rollout = collector.collect(agent)  # lines 2 and 3
         batch = make_batch(agent, rollout, args, device)
         metrics = update_policy(agent, optimizer, update, batch, args)  # lines 4 to 15
+        metrics = {"charts/learning_rate": remaining * args.learning_rate, **metrics}
         collector.update_agent_statistics(agent)
 
         for step, episodic_return, length in rollout.episodes:

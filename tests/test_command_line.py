@@ -2,9 +2,12 @@
 
 import contextlib
 import json
+import os
+import pty
 import shutil
 import subprocess
 import sys
+import termios
 from pathlib import Path
 
 import gymnasium as gym
@@ -239,10 +242,8 @@ def test_no_progress_bar_where_there_is_no_terminal(tmp_path):
 
 
 def test_a_progress_bar_on_a_terminal(tmp_path):
-    import os
-    import pty
-
     master, slave = pty.openpty()
+    termios.tcsetwinsize(slave, (24, 120))
     process = subprocess.Popen(command(*SMALL, "--run-dir", "run"), cwd=tmp_path, stdout=slave, stderr=slave)
     os.close(slave)
     shown = b""
