@@ -41,18 +41,22 @@ $(VENV)/python:
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing: apt-get install python3.11" >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "$(PYTHON) is older than Python 3.11: make PYTHON=python3.11" >&2; exit 1; }
+ifdef UV
+	uv venv --quiet --allow-existing --python $(PYTHON) $(VENV)
+else
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	    echo "Python's venv is missing: apt-get install python3.11-venv" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
+endif
 	@touch $@
 
 $(VENV)/ready: pyproject.toml requirements.lock | $(VENV)/python
-	@echo "downloading PyTorch and 40 other packages, DOWNLOAD_RUN (5.6 GB on disk), once; the README tells how to get the small PyTorch"
+	@echo "downloading PyTorch and its GPU libraries, 3.1 GB (5.7 GB on disk), once; the README tells how to get by with 0.3 GB"
 	@$(if $(UV),true,$(INSTALL) --upgrade "pip>=25.1")
 	$(INSTALL) --constraint requirements.lock --editable .
 	@touch $@
 
 $(VENV)/ready-test: $(VENV)/ready
-	@echo "downloading what the tests need, DOWNLOAD_TEST, once"
+	@echo "downloading what the tests need, 0.2 GB, once"
 	$(INSTALL) --constraint requirements.lock --editable . --group test
 	@touch $@
