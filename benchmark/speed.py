@@ -28,7 +28,7 @@ PEER = "stable-baselines3"
 class Args:
     what: tyro.conf.Positional[Literal["ppo"]]
     """what to time"""
-    rounds: int = 5
+    rounds: int = 4
     """how often each contender runs, in turn"""
     out: Path = ROOT / "benchmark" / "results" / "speed"
     """folder for the results"""
@@ -46,8 +46,8 @@ class Work:
 PPO_WORK = [
     Work("kle/HalfCheetah-v2", 10, 10),
     Work("kle/Hopper-v2", 10, 10),
-    Work("kle/HalfCheetah-v2", 80, 3),
-    Work("kle/Hopper-v2", 80, 3),
+    Work("kle/HalfCheetah-v2", 80, 2),
+    Work("kle/Hopper-v2", 80, 2),
 ]
 
 

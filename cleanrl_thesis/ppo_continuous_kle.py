@@ -597,18 +597,17 @@ def numpy_policy(agent: Agent):
 
     On the CPU it shares the agent's memory; on a GPU it is a copy, to be made anew after each update.
     """
-    layers = []
-    for module in agent.actor_mean:
-        if isinstance(module, nn.Linear):
-            weight, bias = module.weight.detach().cpu().numpy(), module.bias.detach().cpu().numpy()
-            layers.append(lambda x, w=weight.T, b=bias: x.dot(w) + b)
-        else:
-            layers.append({Tanh: np.tanh, nn.ReLU: lambda x: np.maximum(x, 0)}[type(module)])
+    linears = [module for module in agent.actor_mean if isinstance(module, nn.Linear)]
+    layers = [[tensor.detach().cpu().numpy() for tensor in (linear.weight.T, linear.bias)] for linear in linears]
+    activation = np.tanh if isinstance(agent.actor_mean[1], Tanh) else functools.partial(np.maximum, 0.0)
 
     def forward(x: np.ndarray) -> np.ndarray:
-        for layer in layers:
-            x = layer(x)
-        return x
+        for weight, bias in layers[:-1]:
+            x = x.dot(weight)
+            x += bias
+            activation(x, out=x)
+        weight, bias = layers[-1]
+        return x.dot(weight) + bias
 
     return forward
 
@@ -727,8 +726,9 @@ class Collector:
         """Raw observations (..., O) to the agent's input (section 4.3.2, item 3)."""
         if not self.args.norm_obs:
             return obs
-        divisor = self.obs_stats.divisor(self.args.norm_divisor)
-        return bounded((obs - self.obs_stats.mean) / divisor, -self.args.clip_obs, self.args.clip_obs)
+        scaled = obs - self.obs_stats.mean
+        scaled /= self.obs_stats.divisor(self.args.norm_divisor)
+        return bounded(scaled, -self.args.clip_obs, self.args.clip_obs)
 
     def scale_reward(self, reward: float, discounted_return: float) -> float:
         """Divide by the running scale of the discounted return (section 4.3.2, item 4)."""
@@ -895,7 +895,7 @@ def ppo_loss(
     ent_coef: float,
     vf_coef: float,
 ) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-    """The loss to minimise, and as scalars the policy's loss and the value function's.
+    """The loss to minimise, and as scalars the policy's loss, the value's and the share of clipped ratios.
 
     `outputs` are the agent's for the minibatch: mean (M, A), logstd (A,), value (M,).
     """
@@ -918,12 +918,9 @@ def ppo_loss(
     loss = pg_loss + vf_coef * v_loss
     if ent_coef:
         loss = loss - ent_coef * gaussian_entropy(logstd)
-    return loss, (pg_loss, v_loss)
-
-
-def log_ratio(agent: Agent, batch: Batch) -> torch.Tensor:
-    """log ρ_t(θ) = log π_k(a|s) − log π_old(a|s), (B,)."""
-    return gaussian_log_prob(agent.actor_mean(batch.obs), agent.actor_logstd, batch.actions) - batch.logprobs
+    with torch.no_grad():
+        clipfrac = (clipped_ratio != ratio).float().mean()
+    return loss, (pg_loss, v_loss, clipfrac)
 
 
 @torch.no_grad()
@@ -932,7 +929,8 @@ def kl_estimates(agent: Agent, batch: Batch, old_logstd: torch.Tensor) -> dict[s
 
     k1 and k3 estimate D_KL(π_old ‖ π_k) from the actions taken; "exact-new-old" is Eq. 4.3.1 in closed form.
     """
-    mean, logstd, logratio = agent.actor_mean(batch.obs), agent.actor_logstd, log_ratio(agent, batch)
+    mean, logstd = agent.actor_mean(batch.obs), agent.actor_logstd
+    logratio = gaussian_log_prob(mean, logstd, batch.actions) - batch.logprobs  # log ρ_t(θ)
     return {
         "k1": -logratio.mean(),
         "k3": (torch.exp(logratio) - 1 - logratio).mean(),
@@ -1097,7 +1095,7 @@ def update_policy(agent: Agent, optimizer: FlatAdam, update, batch: Batch, args:
             update(minibatch)  # line 7
         if measured and args.kl_timing == "before-last-step":
             kl = kl_estimates(agent, samples, old_logstd)[args.kl_estimator].item()
-        pg_loss, v_loss = update(last)
+        pg_loss, v_loss, clipfrac = update(last)
         if measured and args.kl_timing == "after-iteration":
             kl = kl_estimates(agent, samples, old_logstd)[args.kl_estimator].item()  # line 9
         if early_stopping and kl > args.d_target:  # line 10
@@ -1108,16 +1106,13 @@ def update_policy(agent: Agent, optimizer: FlatAdam, update, batch: Batch, args:
             break  # lines 11 and 12
 
     moved = kl_estimates(agent, batch, old_logstd)
-    with torch.no_grad():
-        clipped = (log_ratio(agent, batch).exp() - 1).abs() > args.clip_coef
-        entropy = gaussian_entropy(agent.actor_logstd)
     return {
         "charts/update_iterations": k,
         "charts/rolled_back": int(rolled_back),
         "losses/policy_loss": pg_loss.item(),
         "losses/value_loss": v_loss.item(),
-        "losses/entropy": entropy.item(),
-        "losses/clipfrac": clipped.float().mean().item(),
+        "losses/entropy": gaussian_entropy(agent.actor_logstd).item(),
+        "losses/clipfrac": clipfrac.item(),
         "losses/approx_kl": kl,
         "losses/kl_k1": moved["k1"].item(),
         "losses/kl_k3": moved["k3"].item(),
@@ -1132,15 +1127,8 @@ def update_policy(agent: Agent, optimizer: FlatAdam, update, batch: Batch, args:
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "ppo_continuous_kle 1"
 FINISH = ("eval_episodes", "eval_mode", "capture_video", "save_model", "save_demos")
-FREE_ON_RESUME = [
-    "run_dir",
-    "resume",
-    "stop_at",
-    "checkpoint_interval",
-    "track",
-    "wandb_project_name",
-    "wandb_entity",
-] + [*FINISH]
+FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", *FINISH}
+FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
 
 
 def write_whole(path: Path, content: bytes, keep_old_as: str | None = None) -> None:
@@ -1217,7 +1205,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then has created nothing.
+    The folder stays locked while the process lives. Raises UsageError, and then nothing in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -1348,13 +1336,7 @@ def evaluate(agent: Agent, args: Args, run_dir: Path) -> dict:
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
     returns = [float(play(agent, env, args, seed)["rewards"].sum()) for seed in seeds]
     env.close()
-    evaluation = {
-        "env_id": args.env_id,
-        "mode": args.eval_mode,
-        **summary(returns),
-        "returns": returns,
-        "seeds": seeds,
-    }
+    evaluation = {"env_id": args.env_id, "mode": args.eval_mode, **summary(returns), "returns": returns, "seeds": seeds}
     write_json(run_dir / "evaluation.json", evaluation)
     return evaluation
 
@@ -1490,9 +1472,7 @@ def main(args: Args) -> int:
         optimizer.load_state_dict(checkpoint["optimizer"])
         torch.set_rng_state(checkpoint["torch_rng"])
         if not collector.load_state_dict(checkpoint["collector"]):
-            print(
-                "--resume: the replayed episode differs (other machine or versions?); goes on with it", file=sys.stderr
-            )
+            print("--resume: the replayed episode differs (another machine?), goes on with it", file=sys.stderr)
     update = make_update(agent, optimizer, args)
     arithmetic = f"{type(update).__name__} on {device.type}"
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
@@ -1531,7 +1511,7 @@ def main(args: Args) -> int:
         for name, value in metrics.items():
             writer.add_scalar(name, value, global_step)
         writer.add_scalar("charts/SPS", global_step / training_seconds, global_step)
-        if not all(parameter.isfinite().all() for parameter in agent.parameters()):
+        if not optimizer.vector.isfinite().all():
             raise RunError(f"step {global_step}: the agent's parameters are no longer finite (last losses: {metrics})")
 
         crossed = global_step // args.checkpoint_interval > (global_step - args.batch_size) // args.checkpoint_interval
@@ -1562,9 +1542,7 @@ def main(args: Args) -> int:
     return 0
 
 
-def finish_run(
-    agent: Agent, args: Args, run_dir: Path, global_step: int, seconds: float, writer: SummaryWriter
-) -> None:
+def finish_run(agent: Agent, args: Args, run_dir: Path, global_step: int, seconds: float, writer) -> None:
     """Evaluate, draw, save what was asked for, and write `result.json` last."""
     evaluation = evaluate(agent, args, run_dir)
     for name in ("mean", "std", "min", "max"):
