@@ -192,13 +192,14 @@ def test_loss_is_the_one_derived_by_hand(clip_vloss, norm_adv):
     mean, logstd, value = (x.detach() + 0.1 * torch.randn_like(x) for x in agent(batch.obs))
     weights = {"clip_coef": 0.2, "ent_coef": 0.01, "vf_coef": 0.7}
     loss, parts = ppo.ppo_loss((mean, logstd, value), batch, clip_vloss=clip_vloss, norm_adv=norm_adv, **weights)
-    policy_sum = value_sum = 0.0
+    policy_sum = value_sum = clipped = 0.0
     advantages = batch.advantages.double().numpy()
     if norm_adv:
         advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
     for i in range(B):
         logprob = Normal(mean[i].double(), logstd.double().exp()).log_prob(batch.actions[i].double()).sum()
         ratio = math.exp(logprob - batch.logprobs[i])
+        clipped += ratio < 0.8 or ratio > 1.2
         policy_sum += min(ratio * advantages[i], max(0.8, min(1.2, ratio)) * advantages[i])
         target, old = batch.returns[i].item(), batch.values[i].item()
         error = (value[i].item() - target) ** 2
@@ -208,6 +209,7 @@ def test_loss_is_the_one_derived_by_hand(clip_vloss, norm_adv):
     entropy = Normal(mean[0], logstd.exp()).entropy().sum().item()
     assert parts[0].item() == pytest.approx(-policy_sum / B, abs=1e-5)
     assert parts[1].item() == pytest.approx(value_sum / B, rel=1e-4)
+    assert parts[2].item() == pytest.approx(clipped / B) and clipped > 0
     assert ppo.gaussian_entropy(logstd).item() == pytest.approx(entropy, rel=1e-5)
     assert loss.item() == pytest.approx(-policy_sum / B - 0.01 * entropy + 0.7 * value_sum / B, rel=1e-4)
 
