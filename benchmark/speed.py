@@ -1,9 +1,9 @@
 """Steps per second beside peers: alternating whole processes in one run on one machine, one thread each.
 
-    python benchmark/speed.py ppo                 # about 15 minutes; needs the group `bench`
-    python benchmark/speed.py ppo --rounds 1      # a first look
+    python benchmark/speed.py ppo                                  # about 15 minutes; needs the group `bench`
+    python benchmark/speed.py ppo --update-epochs 10 --rounds 1    # a first look
 
-Writes `benchmark/results/speed/ppo.json` and `ppo.md`: the median of each contender and of its ratios to the peer, round
+Writes `benchmark/results/speed/ppo_k10.json` and `.md`, and the same for K = 80: the median of each contender and of its ratios to the peer, round
 by round, with their range. The ratios are the result: the machine's own speed drifts.
 """
 
@@ -30,6 +30,8 @@ class Args:
     """what to time"""
     rounds: int = 4
     """how often each contender runs, in turn"""
+    update_epochs: tuple[int, ...] = (10, 80)
+    """the K to time, each with a result of its own"""
     out: Path = ROOT / "benchmark" / "results" / "speed"
     """folder for the results"""
 
@@ -43,12 +45,7 @@ class Work:
     iterations: int
 
 
-PPO_WORK = [
-    Work("kle/HalfCheetah-v2", 10, 10),
-    Work("kle/Hopper-v2", 10, 10),
-    Work("kle/HalfCheetah-v2", 80, 2),
-    Work("kle/Hopper-v2", 80, 2),
-]
+TASKS = ("kle/HalfCheetah-v2", "kle/Hopper-v2")
 
 
 def run_process(command: list[str], folder: str) -> tuple[str, float]:
@@ -113,20 +110,26 @@ def table(results: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(args: Args) -> None:
-    results = []
-    args.out.mkdir(parents=True, exist_ok=True)
+def write_results(args: Args, update_epochs: int, results: list[dict]) -> None:
+    """Write the figures of one K as JSON and as a table."""
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
-    about = {"command": f"python benchmark/speed.py {args.what} --rounds {args.rounds}", "commit": commit}
-    about |= {"python": platform.python_version(), "threads": 1, "cores": os.cpu_count()}
-    for work in PPO_WORK:
-        results.append(measure(work, args.rounds))
-        (args.out / f"{args.what}.json").write_text(json.dumps({**about, "results": results}, indent=1) + "\n")
-    heading = (
-        f"Steps per second, {args.rounds} rounds in turn, one thread each (`{about['command']}`, commit {commit[:7]})"
+    line = f"python benchmark/speed.py {args.what} --update-epochs {update_epochs} --rounds {args.rounds}"
+    about = {"command": line, "commit": commit, "python": platform.python_version(), "threads": 1}
+    args.out.mkdir(parents=True, exist_ok=True)
+    path = args.out / f"{args.what}_k{update_epochs}"
+    path.with_suffix(".json").write_text(
+        json.dumps({**about, "cores": os.cpu_count(), "results": results}, indent=1) + "\n"
     )
-    (args.out / f"{args.what}.md").write_text(f"{heading}\n\n{table(results)}")
+    heading = f"Steps per second, {args.rounds} rounds in turn, one thread each (`{line}`, commit {commit[:7]})"
+    path.with_suffix(".md").write_text(f"{heading}\n\n{table(results)}")
     print(table(results))
+
+
+def main(args: Args) -> None:
+    for update_epochs in args.update_epochs:
+        iterations = max(2, 100 // update_epochs)  # the peer's share of a round is about 20 s at K = 10, 40 s at 80
+        results = [measure(Work(task, update_epochs, iterations), args.rounds) for task in TASKS]
+        write_results(args, update_epochs, results)
 
 
 if __name__ == "__main__":
