@@ -51,7 +51,7 @@ endif
 	@touch $@
 
 $(VENV)/ready: pyproject.toml requirements.lock | $(VENV)/python
-	@echo "downloading PyTorch and its GPU libraries, 3.1 GB (5.7 GB on disk), once; the README tells how to get by with 0.3 GB"
+	@echo "downloading PyTorch and its GPU libraries, 3.1 GB (5.7 GB on disk), once; the README tells how to do without the GPU part"
 	@$(if $(UV),true,$(INSTALL) --upgrade "pip>=25.1")
 	$(INSTALL) --constraint requirements.lock --editable .
 	@touch $@
