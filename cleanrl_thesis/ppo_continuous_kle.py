@@ -76,7 +76,10 @@ import torch
 import torch.nn as nn
 import tyro
 from gymnasium.envs.mujoco import MujocoEnv
+from gymnasium.envs.mujoco.hopper_v4 import HopperEnv
 from gymnasium.envs.mujoco.humanoid_v4 import HumanoidEnv
+from gymnasium.envs.mujoco.walker2d_v4 import Walker2dEnv
+from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -289,6 +292,23 @@ class ZeroContactHumanoidEnv(HumanoidEnv):
         obs = super()._get_obs()  # (376,), the last 84 are cfrc_ext
         obs[-84:] = 0.0
         return obs
+
+
+class QuickHopperEnv(HopperEnv):
+    """Gymnasium's Hopper-v4, number for number; its health is looked at once a step, and in half the time."""
+
+    healthy_reward = 1.0
+
+    @property
+    def is_healthy(self) -> bool:
+        _, height, angle, *_ = state = self.state_vector().tolist()
+        return height > 0.7 and -0.2 < angle < 0.2 and all(-100 < x < 100 for x in state[2:])
+
+
+class QuickWalker2dEnv(Walker2dEnv):
+    """Gymnasium's Walker2d-v4, number for number; its health is looked at once a step."""
+
+    healthy_reward = 1.0
 
 
 class ArmEnv(MujocoEnv):
@@ -511,7 +531,7 @@ def add_free_joint(body, name: str, **options) -> None:
 STUDY_TASKS = {
     "Ant": ("gymnasium.envs.mujoco.ant_v4:AntEnv", 1000),
     "HalfCheetah": ("gymnasium.envs.mujoco.half_cheetah_v4:HalfCheetahEnv", 1000),
-    "Hopper": ("gymnasium.envs.mujoco.hopper_v4:HopperEnv", 1000),
+    "Hopper": (QuickHopperEnv, 1000),
     "Humanoid": (ZeroContactHumanoidEnv, 1000),
     "InvertedPendulum": ("gymnasium.envs.mujoco.inverted_pendulum_v4:InvertedPendulumEnv", 1000),
     "Pusher": (PusherEnv, 100),
@@ -519,7 +539,7 @@ STUDY_TASKS = {
     "Striker": (StrikerEnv, 100),
     "Swimmer": ("gymnasium.envs.mujoco.swimmer_v4:SwimmerEnv", 1000),
     "Thrower": (ThrowerEnv, 100),
-    "Walker2d": ("gymnasium.envs.mujoco.walker2d_v4:Walker2dEnv", 1000),
+    "Walker2d": (QuickWalker2dEnv, 1000),
 }
 for task_name, (task_entry_point, task_max_steps) in STUDY_TASKS.items():
     if f"kle/{task_name}-v2" not in gym.registry:
@@ -543,6 +563,9 @@ def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     for name, space in (("observations", env.observation_space), ("actions", env.action_space)):
         require(isinstance(space, gym.spaces.Box), "--env-id", env_id, f"needs Box {name}, this one has {space}")
+    model = getattr(env.unwrapped, "model", None)
+    if isinstance(model, mujoco.MjModel) and model.ntree == 1:  # it is one island: looking for more takes 3 to 7%
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     return env
 
 
@@ -550,10 +573,17 @@ def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
 # Networks
 # ---------------------------------------------------------------------------------------------------------------------
 class Tanh(nn.Module):
-    """tanh(x), in a compiled graph as 2σ(2x) − 1: the same to float tolerance, and a sixth off the whole update step."""
+    """tanh(x) by the fastest way that there is, to float tolerance.
+
+    In a compiled graph that is 2σ(2x) − 1, a sixth off the whole update step; on the CPU without a gradient it is numpy.
+    """
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return 2 * torch.sigmoid(2 * x) - 1 if torch.compiler.is_compiling() else torch.tanh(x)
+        if torch.compiler.is_compiling():
+            return 2 * torch.sigmoid(2 * x) - 1
+        if x.device.type == "cpu" and not torch.is_grad_enabled():
+            return torch.from_numpy(np.tanh(x.numpy()))
+        return torch.tanh(x)
 
 
 def mlp(sizes: list[int], activation: str, ortho_init: bool, hidden_gain: float, output_gain: float) -> nn.Sequential:
@@ -652,9 +682,15 @@ def bounded(x: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) ->
 EVALUATION_STREAM, DEMONSTRATION_STREAM = 1_000_000, 1_000_001
 
 
+@functools.lru_cache
+def episode_seeds(seed: int, stream: int, block: int) -> list[int]:
+    """Seeds of episodes 256 · block and on; a SeedSequence for each would take longer than the environment's reset."""
+    return np.random.SeedSequence([seed, stream, block]).generate_state(256).tolist()
+
+
 def episode_seed(seed: int, stream: int, episode: int) -> int:
     """Seed of an episode: sub-environment `stream` of run `seed`, or one of the two streams that are not trained on."""
-    return int(np.random.SeedSequence([seed, stream, episode]).generate_state(1)[0])
+    return episode_seeds(seed, stream, episode // 256)[episode % 256]
 
 
 class Episode:
@@ -1022,7 +1058,7 @@ class CompiledUpdate(PlainUpdate):
         names = {parameter: name for name, parameter in agent.named_parameters()}
         self.names = [names[parameter] for parameter in optimizer.parameters]
         self.variables = (optimizer.vector, optimizer.mean, optimizer.square, optimizer.step)
-        self.compiled = torch.compile(self.step)
+        self.compiled = torch.compile(self.step, options={"cpp_wrapper": True})  # kernels called from C++: saves 25 µs
         example = optimizer.vector.new_zeros(batch_rows, len(agent.obs_mean) + 2 * len(agent.actor_logstd) + 4)
         torch.compiler.set_stance("default")
         with torch.no_grad():  # compiles, and changes nothing but copies
@@ -1262,6 +1298,12 @@ class CsvLog:
         self.file.flush()
         os.fsync(self.file.fileno())
         return self.file.tell()
+
+
+def add_scalars(writer: SummaryWriter, values: dict[str, float], step: int) -> None:
+    """Log scalars as one event of TensorBoard, in less time than `SummaryWriter.add_scalar` takes for one of them."""
+    summary = Summary(value=[Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()])
+    writer.file_writer.add_summary(summary, step)
 
 
 class StopSignal:
@@ -1504,17 +1546,15 @@ def main(args: Args) -> int:
         for step, episodic_return, length in rollout.episodes:
             row = {"global_step": global_step + step, "episodic_return": episodic_return, "episodic_length": length}
             episodes_csv.write(row)
-            writer.add_scalar("charts/episodic_return", episodic_return, global_step + step)
-            writer.add_scalar("charts/episodic_length", length, global_step + step)
+            charts = {"charts/episodic_return": episodic_return, "charts/episodic_length": length}
+            add_scalars(writer, charts, global_step + step)
             progress.set_postfix_str(f"return {episodic_return:.1f}", refresh=False)
         global_step += args.batch_size
         progress.update(args.batch_size)
         now = time.perf_counter()
         training_seconds, last_time = training_seconds + now - last_time, now
         updates_csv.write({"global_step": global_step, **metrics})
-        for name, value in metrics.items():
-            writer.add_scalar(name, value, global_step)
-        writer.add_scalar("charts/SPS", global_step / training_seconds, global_step)
+        add_scalars(writer, {**metrics, "charts/SPS": global_step / training_seconds}, global_step)
         if not optimizer.vector.isfinite().all():
             raise RunError(f"step {global_step}: the agent's parameters are no longer finite (last losses: {metrics})")
 
