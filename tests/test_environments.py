@@ -199,7 +199,9 @@ def test_episode_seeds_do_not_repeat_between_neighbouring_seeds_and_environments
     assert len(seeds) == 2000
 
 
-@pytest.mark.parametrize("task, version", [("Hopper", "v4"), ("Walker2d", "v4"), ("HalfCheetah", "v4"), ("Swimmer", "v4")])
+@pytest.mark.parametrize(
+    "task, version", [("Hopper", "v4"), ("Walker2d", "v4"), ("HalfCheetah", "v4"), ("Swimmer", "v4")]
+)
 def test_what_is_left_out_to_save_time_changes_no_number(task, version):
     """Fewer looks at the health and no search for islands: the same bytes as Gymnasium's own environment."""
     quick, plain = ppo.make_env(f"kle/{task}-v2"), gym.make(f"{task}-{version}")
