@@ -1018,16 +1018,16 @@ class FlatAdam:
             tensor.copy_(state[name])
 
 
-def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float) -> None:
-    """Clip the gradient's norm (section 4.3.2, item 8) and take one step of Adam; changes the first four in place.
+def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float, eps: float) -> None:
+    """Clip the gradient's norm and take one step of Adam; changes the first four in place.
 
-    All are of shape (P,) but `step`, which counts and is a scalar.
+    All tensors are of shape (P,) but `step`, which counts and is a scalar, and `rates`, which may be one too.
     """
     gradient = gradient * (max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0)
     step.add_(1)
     mean.lerp_(gradient, 1 - 0.9)
     square.mul_(0.999).addcmul_(gradient, gradient, value=1 - 0.999)
-    denominator = (square / (1 - 0.999**step)).sqrt_().add_(1e-5)
+    denominator = (square / (1 - 0.999**step)).sqrt_().add_(eps)
     vector.sub_(rates * (mean / (1 - 0.9**step)) / denominator)
 
 
@@ -1046,8 +1046,11 @@ class PlainUpdate:
         adam.gradient.zero_()
         loss.backward()
         with torch.no_grad():
-            adam_step(adam.vector, adam.mean, adam.square, adam.step, adam.rates, adam.gradient, self.max_grad_norm)
+            self.adam_step(adam.vector, adam.mean, adam.square, adam.step, adam.rates, adam.gradient)
         return parts
+
+    def adam_step(self, vector, mean, square, step, rates, gradient) -> None:
+        adam_step(vector, mean, square, step, rates, gradient, self.max_grad_norm, 1e-5)  # section 4.3.2, item 8
 
 
 class CompiledUpdate(PlainUpdate):
@@ -1073,7 +1076,7 @@ class CompiledUpdate(PlainUpdate):
 
     def step(self, vector, mean, square, step, rates, rows) -> tuple[torch.Tensor, ...]:
         gradient, parts = torch.func.grad(self.loss, has_aux=True)(vector, rows)
-        adam_step(vector, mean, square, step, rates, gradient, self.max_grad_norm)
+        self.adam_step(vector, mean, square, step, rates, gradient)
         return parts
 
     def __call__(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:

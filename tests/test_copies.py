@@ -9,8 +9,24 @@ METHODS = sorted(
     path for path in (Path(__file__).parent.parent / "cleanrl_thesis").glob("*.py") if path.name != "__init__.py"
 )
 # (name, file): one line that says why it differs there
-DIFFERS: dict[tuple[str, str], str] = {}
-OWN = {"Args", "Agent", "main", "evaluate", "CHECKPOINT_FORMAT", "FREE_ON_RESUME"}  # each method's own by design
+PPO, DQN, DISTILL = "ppo_continuous_kle.py", "dqn_apple.py", "distill_hybrid.py"
+DIFFERS: dict[tuple[str, str], str] = {
+    ("CompiledUpdate", DQN): "has a target network, and a minibatch of transitions",
+    ("Episode", DQN): "repeats an action for several frames, and needs no discounted return",
+    ("FlatAdam", DQN): "one learning rate; the vector of the target network beside the agent's",
+    ("PlainUpdate", DQN): "has a target network, and a minibatch of transitions",
+    ("make_env", PPO): "Box actions instead of Discrete ones, and MuJoCo's islands",
+    ("make_update", DQN): "has a target network",
+    ("numpy_policy", PPO): "the mean of a Gaussian instead of an action",
+    ("play", PPO): "one environment and normalised observations; the discrete methods play many games side by side",
+    ("record_video", DQN): "repeats an action for several frames, and is always greedy",
+    ("save_demonstrations", PPO): "plays one environment after the other",
+    ("save_demonstrations", DISTILL): "the student's policy, sampled or greedy",
+}
+OWN = {  # each method's own by design
+    *("Args", "Agent", "complete_args", "main", "evaluate", "finish_run", "plot_learning_curve", "print_table"),
+    *("CHECKPOINT_FORMAT", "FINISH", "FREE_ON_RESUME"),
+}
 
 
 def definitions(source: str) -> dict[str, str]:

@@ -1,0 +1,118 @@
+"""How the constants of the Apple game and of its synthetic human were chosen: scores of scripted players.
+
+    python benchmark/apple_players.py                  # both players at the chosen constants, beside Table 2.1
+    python benchmark/apple_players.py --calibrate      # neighbouring constants too, about two minutes
+
+The game is fixed by two published rows that have to fit at once: the shortest-path player near the DQN's, 36.27 ± 5.44
+with at most 53, and a person's near 18.71 ± 2.86. Writes `benchmark/results/apple/players.csv` and `.md`.
+"""
+
+import csv
+import importlib.util
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+ROOT = Path(__file__).resolve().parent.parent
+PUBLISHED = {"shortest path": (36.27, 5.44, 15, 53), "synthetic human": (18.71, 2.86, 11, 27)}  # Table 2.1: DQN, human
+
+
+@dataclass
+class Args:
+    episodes: int = 400
+    """episodes of each player, as in Table 2.1"""
+    seed: int = 1
+    """seed of the games and of the synthetic human"""
+    calibrate: bool = False
+    """also play with neighbouring constants"""
+    out: Path = ROOT / "benchmark" / "results" / "apple"
+    """folder for the results"""
+
+
+def load_method(name: str):
+    """A method file as a module of its own, so that its constants can be changed."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "cleanrl_thesis" / f"{name}.py")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def shortest_path(method):
+    """The player who moves on both axes until each is within half a step: no path takes fewer frames."""
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        way = obs[:, 4:]
+        moves = np.where(np.abs(way) > method.SPEED / 2, np.sign(way), 0).astype(int)
+        return (moves[:, 1] + 1) * 3 + moves[:, 0] + 1
+
+    return act
+
+
+def measure(method, player: str, args: Args) -> dict:
+    """Play with the constants that `method` has now; return them and the scores."""
+    seeds = [method.episode_seed(args.seed, 0, i) for i in range(args.episodes)]
+    human = method.SyntheticHuman(args.episodes, args.seed)
+    policy = human if player == "synthetic human" else shortest_path(method)
+    scores = [episode["rewards"].sum() for episode in method.play(policy, "AppleGame-v0", seeds)]
+    return {
+        "player": player,
+        "speed": float(str(method.SPEED)),
+        "reach": float(str(method.REACH)),
+        "lifetime": method.LIFETIME,
+        "reaction": human.reaction if player == "synthetic human" else "",
+        "episodes": args.episodes,
+        "mean": round(float(np.mean(scores)), 2),
+        "std": round(float(np.std(scores)), 2),
+        "min": int(min(scores)),
+        "max": int(max(scores)),
+    }
+
+
+def neighbours(method, args: Args):
+    """Rows at other constants: for each lifetime the speed at which the shortest path scores as published."""
+    speed, lifetime, reaction = method.SPEED, method.LIFETIME, method.SyntheticHuman.reaction
+    for frames in (45, 60, 75, 90, 120):
+        slow, fast = 0.006, 0.012
+        for _ in range(10):
+            method.LIFETIME, method.SPEED = frames, np.float32(round((slow + fast) / 2, 5))
+            if measure(method, "shortest path", args)["mean"] < PUBLISHED["shortest path"][0]:
+                slow = (slow + fast) / 2
+            else:
+                fast = (slow + fast) / 2
+        yield measure(method, "shortest path", args)
+        for method.SyntheticHuman.reaction in (12.0, 15.0, 18.0, 21.0):
+            yield measure(method, "synthetic human", args)
+    method.SPEED, method.LIFETIME, method.SyntheticHuman.reaction = speed, lifetime, reaction
+
+
+def table(rows: list[dict]) -> str:
+    """The rows as Markdown, the published ones first."""
+    names = list(rows[0])
+    lines = [f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
+    for player, numbers in PUBLISHED.items():
+        published = "Table 2.1: " + {"shortest path": "DQN"}.get(player, "human")
+        cells = [published, "", "", "", "", 400, *numbers[:2], *numbers[2:]]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    lines += [f"| {' | '.join(str(row[name]) for name in names)} |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def main(args: Args) -> None:
+    method = load_method("distill_hybrid")
+    rows = [measure(method, player, args) for player in PUBLISHED]
+    if args.calibrate:
+        rows += neighbours(method, args)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with open(args.out / "players.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    (args.out / "players.md").write_text(table(rows))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
