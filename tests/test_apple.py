@@ -115,7 +115,7 @@ def test_apples_are_uniform_and_unrelated():
         draws.append(games.apples.copy())
     columns = [*draws[0], *draws[1]]
     for column in columns:
-        assert 0 <= column.min() and column.max() < 1
+        assert column.min() >= 0 and column.max() < 1
         assert scipy.stats.kstest(column, "uniform").pvalue > 1e-3
     assert np.abs(np.corrcoef(columns) - np.eye(4)).max() < 0.03
     assert abs(np.corrcoef(columns[0][:-1], columns[0][1:])[0, 1]) < 0.03

@@ -1,0 +1,331 @@
+"""dqn_apple.py and distill_hybrid.py through the command line: runs, resumes, and what a user can get wrong."""
+
+import hashlib
+import io
+import json
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, command, run
+
+from cleanrl_thesis import distill_hybrid as distill
+from cleanrl_thesis import dqn_apple as dqn
+
+DQN, DISTILL = ROOT / "cleanrl_thesis" / "dqn_apple.py", ROOT / "cleanrl_thesis" / "distill_hybrid.py"
+SMALL_DQN = [
+    *("--total-timesteps", 12_000, "--buffer-size", 3_000, "--batch-size", 16, "--checkpoint-interval", 1_000),
+    *("--eval-episodes", 3, "--n-step", 2),
+]
+SMALL_DISTILL = [
+    *("--demo-frames", 3_000, "--test-frames", 500, "--epochs", 12, "--hidden-size", 32, "--eval-episodes", 3),
+    *("--checkpoint-interval", 1),
+]
+
+
+@pytest.fixture(scope="session")
+def teacher(tmp_path_factory) -> Path:
+    """An undisturbed small run of the DQN."""
+    folder = tmp_path_factory.mktemp("dqn")
+    run(*SMALL_DQN, "--run-dir", "run", "--save-model", "--save-demos", 2, cwd=folder, script=DQN)
+    return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def student(tmp_path_factory, teacher) -> Path:
+    """An undisturbed small run of the hybrid."""
+    folder = tmp_path_factory.mktemp("distill")
+    flags = ["--teacher", teacher, "--run-dir", "run", "--save-model", "--save-demos", 2]
+    run(*SMALL_DISTILL, *flags, cwd=folder, script=DISTILL)
+    return folder / "run"
+
+
+def assert_same_run(left: Path, right: Path, names: tuple[str, ...]) -> None:
+    """Same bytes in the records, same tensors in the checkpoints."""
+    for name in names:
+        assert (left / name).read_bytes() == (right / name).read_bytes(), name
+    states = [torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (left, right)]
+    part = "optimizer" if "optimizer" in states[0] else "update"
+    for name, value in states[0][part].items():
+        assert torch.equal(value, states[1][part][name]), name
+
+
+DQN_RECORDS, DISTILL_RECORDS = ("episodes.csv", "updates.csv", "evaluation.json"), ("updates.csv", "evaluation.json")
+
+
+def rows(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def kill(script: Path, flags: list, folder: Path, number: int, watched: str, at_row: int) -> None:
+    """Start or resume a run and send it a signal once a file has `at_row` rows."""
+    line = command(*flags, "--run-dir", folder, "--resume", script=script)
+    process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    while process.poll() is None and rows(folder / watched) < at_row:
+        time.sleep(0.002)
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == (-number if number == signal.SIGKILL else 128 + number), out
+
+
+@pytest.mark.parametrize("extra", [[], ["--num-envs", 2, "--frame-skip", 3]], ids=["one", "two"])
+def test_a_killed_dqn_ends_with_the_same_bytes(extra, teacher, tmp_path):
+    """Killed in mid-episode, hundreds of frames after a checkpoint: the replay file has been written on."""
+    flags = [*SMALL_DQN, *extra]
+    whole = teacher
+    if extra:
+        run(*flags, "--run-dir", "whole", cwd=tmp_path, script=DQN)
+        whole = tmp_path / "whole"
+    for at_row in (3, 5):
+        kill(DQN, flags, tmp_path / "run", signal.SIGKILL, "episodes.csv", at_row)
+    kill(DQN, flags, tmp_path / "run", signal.SIGTERM, "episodes.csv", 6)
+    done = run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path, script=DQN)
+    assert "differs" not in done.stderr
+    assert_same_run(whole, tmp_path / "run", DQN_RECORDS)
+
+
+def test_a_dqn_with_a_torn_checkpoint_finds_its_replay_buffer(teacher, tmp_path):
+    """The checkpoint before the newest is two intervals behind what was written into the ring."""
+    shutil.copytree(teacher, tmp_path / "run")
+    path = tmp_path / "run" / "checkpoint.pt"
+    path.write_bytes(path.read_bytes()[:1000])
+    (tmp_path / "run" / "result.json").unlink()
+    done = run(*SMALL_DQN, "--run-dir", "run", "--resume", cwd=tmp_path, script=DQN)
+    assert "torn" in done.stderr
+    assert_same_run(teacher, tmp_path / "run", DQN_RECORDS)
+
+
+def test_a_killed_student_ends_with_the_same_bytes(student, teacher, tmp_path):
+    flags = [*SMALL_DISTILL, "--teacher", teacher]
+    for at_row in (4, 8):
+        kill(DISTILL, flags, tmp_path / "run", signal.SIGKILL, "updates.csv", at_row)
+    kill(DISTILL, flags, tmp_path / "run", signal.SIGINT, "updates.csv", 10)
+    run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path, script=DISTILL)
+    assert_same_run(student, tmp_path / "run", DISTILL_RECORDS)
+
+
+@pytest.mark.parametrize("script, flags", [(DQN, SMALL_DQN), (DISTILL, [*SMALL_DISTILL, "--alpha", 0])])
+def test_compiled_through_the_command_line(script, flags, tmp_path):
+    done = run(*flags, "--compile", "--run-dir", "run", cwd=tmp_path, script=script)
+    assert "--compile" not in done.stderr
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert state["arithmetic"].lower().startswith("compiled")
+
+
+def test_copied_alone_into_an_empty_folder(student, teacher, tmp_path):
+    for script in (DQN, DISTILL):
+        shutil.copy(script, tmp_path)
+    run(*SMALL_DQN, "--run-dir", "dqn", cwd=tmp_path, script=tmp_path / DQN.name, PYTHONSAFEPATH="1")
+    flags = [*SMALL_DISTILL, "--teacher", teacher, "--run-dir", "student"]
+    run(*flags, cwd=tmp_path, script=tmp_path / DISTILL.name, PYTHONSAFEPATH="1")
+    assert (tmp_path / "dqn" / "updates.csv").read_bytes() == (teacher / "updates.csv").read_bytes()
+    assert (tmp_path / "student" / "updates.csv").read_bytes() == (student / "updates.csv").read_bytes()
+
+
+def test_runs_leave_what_the_readme_says(teacher, student):
+    shared = {"args.json", "checkpoint.pt", "checkpoint.previous.pt", "evaluation.json", "learning_curve.png"}
+    shared |= {"model.safetensors", "result.json", "updates.csv", "demos"}
+    events = {path.name for path in (*teacher.iterdir(), *student.iterdir()) if "tfevents" in path.name}
+    assert {path.name for path in teacher.iterdir()} - events == {*shared, "episodes.csv", "replay.dat"}
+    assert {path.name for path in student.iterdir()} - events == {*shared, "demos_human"}
+
+
+@pytest.mark.parametrize("kind", ["teacher", "student"])
+def test_demonstrations_can_be_played_again_and_read(kind, request):
+    folder = request.getfixturevalue(kind) / "demos"
+    for episode, path in zip(distill.read_demonstrations(folder, "AppleGame-v0"), sorted(folder.glob("*.npz"))):
+        with np.load(path, allow_pickle=False) as arrays:
+            seed, times, rewards = int(arrays["seed"]), arrays["t_ns"], arrays["rewards"]
+        env = dqn.make_env("AppleGame-v0")
+        obs = [env.reset(seed=seed)[0]]
+        for action, reward in zip(episode["actions"], rewards):
+            step = env.step(action)
+            obs.append(step[0])
+            assert step[1] == reward
+        assert np.array_equal(obs, episode["observations"]) and step[3]
+        assert len(times) == 1800 and times[60] == pytest.approx(1e9, abs=100)
+
+
+def test_a_dqn_of_another_environment(tmp_path):
+    flags = ["--env-id", "CartPole-v1", "--total-timesteps", 3000, "--eval-episodes", 2, "--capture-video"]
+    run(*flags, "--run-dir", "run", cwd=tmp_path, script=DQN)
+    assert list((tmp_path / "run" / "videos").glob("*.mp4"))
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["complete"]
+
+
+@pytest.mark.parametrize("flags", [["--states", "own", "--alpha", 0.5], ["--split", "episode", "--temperature", 0]])
+def test_the_other_ways_to_learn(flags, teacher, tmp_path):
+    run(*SMALL_DISTILL, "--teacher", teacher, *flags, "--run-dir", "run", cwd=tmp_path, script=DISTILL)
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["evaluation"]["sampled"]["episodes"] == 3
+
+
+def test_recorded_demonstrations_are_those_that_are_learned_from(student, teacher, tmp_path):
+    """The synthetic human's folder given as a recording leads to the same student."""
+    flags = [*SMALL_DISTILL, "--teacher", teacher, "--demos", student / "demos_human", "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=DISTILL)
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (student / "updates.csv").read_bytes()
+
+
+# What a user can get wrong
+def assert_refused(module, capsys, flags: list, words: list[str]) -> None:
+    """Exit code 2, one line on stderr with the words, nothing on stdout."""
+    assert module.cli([str(flag) for flag in flags]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and err.startswith("error: "), err
+    for word in words:
+        assert word in err, err
+
+
+BAD_DQN = [
+    (["--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "Discrete"]),
+    (["--env-id", "NoSuchGame-v0"], ["NoSuchGame"]),
+    (["--total-timesteps", 3, "--num-envs", 4], ["--total-timesteps", "4 frames"]),
+    (["--batch-size", 64, "--buffer-size", 32], ["--batch-size", "64", "32"]),
+    (["--end-e", "2"], ["--end-e", "2.0", "between 0 and 1"]),
+    (["--gamma", "nan"], ["--gamma", "nan"]),
+    (["--train-frequency", 0], ["--train-frequency", "0"]),
+    (["--n-step", 0], ["--n-step", "0"]),
+    (["--learning-rate", "-1"], ["--learning-rate"]),
+    (["--no-such-flag"], ["--no-such-flag"]),
+    (["--resume"], ["--resume", "--run-dir"]),
+]
+BAD_DISTILL = [
+    (["--alpha", 0.5], ["--alpha", "0.5", "--teacher"]),
+    (["--alpha", 1.5], ["--alpha", "1.5", "between 0 and 1"]),
+    (["--alpha", "nan"], ["--alpha", "nan"]),
+    (["--alpha", 0, "--temperature", -1], ["--temperature", "-1.0"]),
+    (["--alpha", 0, "--dropout", 1], ["--dropout", "1.0", "less than 1"]),
+    (["--alpha", 0, "--test-frames", 16_000], ["--test-frames", "16000"]),
+    (["--alpha", 0, "--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "--demos"]),
+    (["--alpha", 0, "--states", "mine"], ["--states", "mine"]),
+    (["--teacher", "no/such/folder"], ["--teacher", "no/such/folder", "model.safetensors"]),
+    (["--alpha", 0, "--demos", "no/such/folder"], ["--demos", "no/such/folder", "manifest"]),
+]
+
+
+@pytest.mark.parametrize(
+    "module, flags, words",
+    [(dqn, *case) for case in BAD_DQN] + [(distill, *case) for case in BAD_DISTILL],
+    ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) and str(value[0])[:2] == "--" else "",
+)
+def test_a_wrong_value_is_one_line_and_creates_nothing(module, flags, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(module, capsys, flags, words)
+    assert not list(tmp_path.iterdir())
+
+
+def rewrite(folder: Path, change) -> None:
+    """Change the arrays of the first demonstration and sign it anew."""
+    path = folder / "episode_00000.npz"
+    with np.load(path) as arrays:
+        changed = change(dict(arrays))
+    content = io.BytesIO()
+    np.savez(content, **changed)
+    path.write_bytes(content.getvalue())
+    sign(folder, path)
+
+
+def sign(folder: Path, path: Path) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["files"][path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def edit_manifest(folder: Path, **changes) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps({**manifest, **changes}))
+
+
+def flip_a_byte(folder: Path) -> None:
+    path = folder / "episode_00000.npz"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def no_archive(folder: Path) -> None:
+    (folder / "episode_00000.npz").write_bytes(b"no archive")
+    sign(folder, folder / "episode_00000.npz")
+
+
+def pickled(folder: Path) -> None:
+    rewrite(folder, lambda arrays: {**arrays, "actions": np.array([{"an": "object"}], object)})
+
+
+def empty(folder: Path) -> None:
+    for path in folder.iterdir():
+        path.unlink()
+
+
+@pytest.mark.parametrize(
+    "damage, words",
+    [
+        (empty, ["no readable manifest.json"]),
+        (lambda folder: edit_manifest(folder, files={}), ["names no file"]),
+        (lambda folder: edit_manifest(folder, env_id="ALE/Gopher-v5"), ["ALE/Gopher-v5", "AppleGame-v0"]),
+        (lambda folder: (folder / "episode_00000.npz").unlink(), ["episode_00000.npz", "cannot be read"]),
+        (flip_a_byte, ["episode_00000.npz", "SHA-256"]),
+        (no_archive, ["episode_00000.npz", "no demonstration"]),
+        (pickled, ["episode_00000.npz", "no demonstration"]),
+        (lambda f: rewrite(f, lambda a: {**a, "observations": a["observations"][:, :5]}), ["(T + 1, 6)", "(1801, 5)"]),
+        (lambda f: rewrite(f, lambda a: {**a, "observations": a["observations"][:-1]}), ["(T + 1, 6)", "(1800, 6)"]),
+        (lambda f: rewrite(f, lambda a: {**a, "observations": a["observations"] * np.nan}), ["finite"]),
+        (lambda f: rewrite(f, lambda a: {**a, "actions": a["actions"] + 5}), ["actions", "from 0 to 8"]),
+        (lambda f: rewrite(f, lambda a: {**a, "actions": a["actions"] * 0.5}), ["actions", "whole numbers"]),
+        (lambda f: rewrite(f, lambda a: {k: v for k, v in a.items() if k != "actions"}), ["no demonstration"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_wrong_demonstration_is_named(damage, words, student, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(student / "demos", "demos")
+    damage(Path("demos"))
+    flags = ["--alpha", 0, "--demos", "demos", "--demo-frames", 3000, "--run-dir", "run"]
+    assert_refused(distill, capsys, flags, ["--demos demos", *words])
+    assert not Path("run").exists()
+
+
+def test_too_few_demonstrations_are_named(student, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(distill, capsys, ["--alpha", 0, "--demos", student / "demos"], ["--demo-frames 16000", "3600"])
+
+
+def test_a_teacher_of_another_game_is_named(teacher, tmp_path, monkeypatch, capsys):
+    import safetensors.torch
+
+    monkeypatch.chdir(tmp_path)
+    tensors = safetensors.torch.load_file(teacher / "model.safetensors")
+    for metadata, words in (
+        ({"args": json.dumps({"env_id": "ALE/Gopher-v5", "dueling": True})}, ["ALE/Gopher-v5", "AppleGame-v0"]),
+        ({"args": json.dumps({"env_id": "AppleGame-v0", "dueling": False})}, ["another shape"]),
+        ({}, ["no model of dqn_apple.py"]),
+    ):
+        safetensors.torch.save_file(tensors, "model.safetensors", metadata)
+        assert_refused(distill, capsys, ["--teacher", ".", "--run-dir", "run"], ["--teacher", *words])
+    Path("model.safetensors").write_bytes(b"no model")
+    assert_refused(distill, capsys, ["--teacher", ".", "--run-dir", "run"], ["--teacher", "no model of dqn_apple.py"])
+    assert not Path("run").exists()
+
+
+@pytest.mark.parametrize(
+    "kind, module, flags",
+    [("teacher", dqn, [*SMALL_DQN, "--gamma", 0.9]), ("student", distill, [*SMALL_DISTILL, "--alpha", 0])],
+)
+def test_a_resume_with_other_hyperparameters_names_them(kind, module, flags, request, tmp_path, capsys):
+    shutil.copytree(request.getfixturevalue(kind), tmp_path / "run")
+    flag, value = flags[-2:]
+    assert_refused(module, capsys, [*flags, "--run-dir", tmp_path / "run", "--resume"], [f"{flag} {float(value)}", "was"])
+
+
+def test_a_resume_with_other_demonstrations_is_refused(student, tmp_path):
+    demos, flags = tmp_path / "demos", [*SMALL_DISTILL, "--alpha", 0, "--demos", "demos", "--run-dir", "run"]
+    shutil.copytree(student / "demos_human", demos)
+    run(*flags, cwd=tmp_path, script=DISTILL)
+    rewrite(demos, lambda arrays: {**arrays, "actions": 8 - arrays["actions"]})
+    done = run(*flags, "--resume", "--eval-episodes", 4, cwd=tmp_path, script=DISTILL, code=2)
+    assert "--resume" in done.stderr and "demonstrations" in done.stderr and done.stderr.count("\n") == 1
