@@ -2,9 +2,10 @@
 
     python benchmark/speed.py ppo                                  # about 15 minutes; needs the group `bench`
     python benchmark/speed.py ppo --update-epochs 10 --rounds 1    # a first look
+    python benchmark/speed.py apple                                # the game alone, and DQN on it; about 3 minutes
 
-Writes `benchmark/results/speed/ppo_k10.json` and `.md`, and the same for K = 80: the median of each contender and of its ratios to the peer, round
-by round, with their range. The ratios are the result: the machine's own speed drifts.
+Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple}.json` and `.md`: the median of each contender and of its ratios to
+the peer, round by round, with their range. The ratios are the result: the machine's own speed drifts.
 """
 
 import json
@@ -14,6 +15,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -26,34 +28,32 @@ PEER = "stable-baselines3"
 
 @dataclass
 class Args:
-    what: tyro.conf.Positional[Literal["ppo"]]
+    what: tyro.conf.Positional[Literal["ppo", "apple"]]
     """what to time"""
     rounds: int = 4
     """how often each contender runs, in turn"""
     update_epochs: tuple[int, ...] = (10, 80)
-    """the K to time, each with a result of its own"""
+    """the K of PPO to time, each with a result of its own"""
     out: Path = ROOT / "benchmark" / "results" / "speed"
     """folder for the results"""
 
 
 @dataclass
 class Work:
-    """What every contender does: `iterations` of 2,048 steps and K update iterations."""
+    """What every contender does."""
 
     env_id: str
-    update_epochs: int
-    iterations: int
+    update_epochs: int | None  # K of PPO
+    steps: int
 
 
 TASKS = ("kle/HalfCheetah-v2", "kle/Hopper-v2")
 
 
 def run_process(command: list[str], folder: str) -> tuple[str, float]:
-    """Run a command with one thread; return what it prints and its peak resident memory in MB."""
-    single = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
-    env = {**os.environ, **single}
+    """Run a command; return what it prints and its peak resident memory in MB."""
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    process = subprocess.Popen(command, cwd=folder, env=env, **streams)
+    process = subprocess.Popen(command, cwd=folder, **streams)
     out = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
     if status != 0:
@@ -61,41 +61,71 @@ def run_process(command: list[str], folder: str) -> tuple[str, float]:
     return out, usage.ru_maxrss / 1024
 
 
-def time_peer(work: Work) -> dict[str, float]:
-    command = [sys.executable, str(ROOT / "benchmark" / "sb3_ppo.py"), work.env_id]
-    out, memory = run_process([*command, str(work.update_epochs), str(work.iterations)], str(ROOT))
+def time_peer(*words: object) -> dict[str, float]:
+    """Run a peer's script, which prints its figures as JSON."""
+    script, *arguments = map(str, words)
+    out, memory = run_process([sys.executable, str(ROOT / "benchmark" / script), *arguments], str(ROOT))
     return {**json.loads(out.splitlines()[-1]), "peak_memory_mb": memory}
 
 
-def time_ours(work: Work, *flags: str) -> dict[str, float]:
-    script = ROOT / "cleanrl_thesis" / "ppo_continuous_kle.py"
-    steps = 2048 * work.iterations
-    settings = ["--env-id", work.env_id, "--update-epochs", work.update_epochs, "--total-timesteps", steps]
+def time_ours(script: str, *flags: object) -> dict[str, float]:
+    """Run a method; its steps per second are those of training alone, without start, compilation and evaluation."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, script, *settings, "--eval-episodes", 1, "--run-dir", "run", *flags]
+        command = [sys.executable, ROOT / "cleanrl_thesis" / script, *flags, "--eval-episodes", 1, "--run-dir", "run"]
         _, memory = run_process([str(word) for word in command], folder)
         result = json.loads((Path(folder) / "run" / "result.json").read_text())
     return {"steps_per_second": result["steps_per_second"], "peak_memory_mb": memory}
 
 
-CONTENDERS = {PEER: time_peer, "plain": time_ours, "--compile": lambda work: time_ours(work, "--compile")}
+def ppo_contenders(work: Work) -> dict:
+    flags = ["--env-id", work.env_id, "--update-epochs", work.update_epochs, "--total-timesteps", work.steps]
+    return {
+        PEER: lambda: time_peer("sb3_ppo.py", work.env_id, work.update_epochs, work.steps // 2048),
+        "plain": lambda: time_ours("ppo_continuous_kle.py", *flags),
+        "--compile": lambda: time_ours("ppo_continuous_kle.py", *flags, "--compile"),
+    }
 
 
-def measure(work: Work, rounds: int) -> dict:
+def dqn_contenders(work: Work) -> dict:
+    flags = ["--total-timesteps", work.steps]
+    return {
+        PEER: lambda: time_peer("sb3_dqn.py", work.steps),
+        "plain": lambda: time_ours("dqn_apple.py", *flags),
+        "--compile": lambda: time_ours("dqn_apple.py", *flags, "--compile"),
+    }
+
+
+def measure(work: Work, contenders: dict, rounds: int) -> dict:
     """Let the contenders run in turn; return each one's figures, round by round, and its ratios to the peer."""
-    figures = {name: [] for name in CONTENDERS}
+    figures = {name: [] for name in contenders}
+    name_of_work = work.env_id if work.update_epochs is None else f"{work.env_id} K={work.update_epochs}"
     for round_number in range(rounds):
-        for name, contender in CONTENDERS.items():
-            figures[name].append(contender(work))
+        for name, contender in contenders.items():
+            figures[name].append(contender())
             speed = figures[name][-1]["steps_per_second"]
-            print(
-                f"{work.env_id} K={work.update_epochs} round {round_number + 1} {name}: {speed:,.0f} steps/s",
-                flush=True,
-            )
+            print(f"{name_of_work} round {round_number + 1} {name}: {speed:,.0f} steps/s", flush=True)
     speeds = {name: [row["steps_per_second"] for row in rows] for name, rows in figures.items()}
-    ratios = {name: [own / peer for own, peer in zip(speeds[name], speeds[PEER])] for name in CONTENDERS}
+    ratios = {name: [own / peer for own, peer in zip(speeds[name], speeds[PEER])] for name in contenders}
     memory = {name: max(row["peak_memory_mb"] for row in rows) for name, rows in figures.items()}
     return {**vars(work), "steps_per_second": speeds, "ratio": ratios, "peak_memory_mb": memory}
+
+
+def time_game(num_envs: int, steps: int, rounds: int) -> list[float]:
+    """Game steps per second of the vectorised Apple game alone, with random actions, one thread, round by round."""
+    import gymnasium as gym
+    import numpy as np
+
+    name = "cleanrl_thesis.dqn_apple:AppleGame-v0"
+    games = gym.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point")
+    games.reset(seed=1)
+    actions = np.random.default_rng(1).integers(0, 9, (steps, num_envs))
+    speeds = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        for action in actions:
+            games.step(action)
+        speeds.append(num_envs * steps / (time.perf_counter() - start))
+    return speeds
 
 
 def table(results: list[dict]) -> str:
@@ -105,32 +135,43 @@ def table(results: list[dict]) -> str:
         for name, ratios in row["ratio"].items():
             speed = f"{statistics.median(row['steps_per_second'][name]):,.0f}"
             spread = f"{min(ratios):.2f} to {max(ratios):.2f}"
-            cells = (row["env_id"], row["update_epochs"], name, speed, f"{statistics.median(ratios):.2f}", spread)
+            cells = (row["env_id"], row["update_epochs"] or "", name, speed, f"{statistics.median(ratios):.2f}", spread)
             lines.append(f"| {' | '.join(map(str, cells))} | {row['peak_memory_mb'][name]:.0f} |")
     return "\n".join(lines) + "\n"
 
 
-def write_results(args: Args, update_epochs: int, results: list[dict]) -> None:
-    """Write the figures of one K as JSON and as a table."""
+def write_results(args: Args, name: str, flags: str, results: list[dict], more: dict | None = None) -> None:
+    """Write the figures as JSON and as a table; `flags` are those that this part of the measurement depends on."""
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
-    line = f"python benchmark/speed.py {args.what} --update-epochs {update_epochs} --rounds {args.rounds}"
+    line = f"python benchmark/speed.py {args.what}{flags} --rounds {args.rounds}"
     about = {"command": line, "commit": commit, "python": platform.python_version(), "threads": 1}
     args.out.mkdir(parents=True, exist_ok=True)
-    path = args.out / f"{args.what}_k{update_epochs}"
-    path.with_suffix(".json").write_text(
-        json.dumps({**about, "cores": os.cpu_count(), "results": results}, indent=1) + "\n"
-    )
-    heading = f"Steps per second, {args.rounds} rounds in turn, one thread each (`{line}`, commit {commit[:7]})"
-    path.with_suffix(".md").write_text(f"{heading}\n\n{table(results)}")
-    print(table(results))
+    figures = {**about, "cores": os.cpu_count(), **(more or {}), "results": results}
+    (args.out / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
+    text = f"Steps per second, {args.rounds} rounds in turn, one thread each (`{line}`, commit {commit[:7]})\n\n{table(results)}"
+    for key, speeds in (more or {}).items():
+        median, low, high = (f"{value / 1e6:.1f}" for value in (statistics.median(speeds), min(speeds), max(speeds)))
+        text += f"\n{key}: {median} million steps/s ({low} to {high})\n"
+    (args.out / f"{name}.md").write_text(text)
+    print(text)
 
 
-def main(args: Args) -> None:
+def time_ppo(args: Args) -> None:
     for update_epochs in args.update_epochs:
-        iterations = max(2, 100 // update_epochs)  # the peer's share of a round is about 20 s at K = 10, 40 s at 80
-        results = [measure(Work(task, update_epochs, iterations), args.rounds) for task in TASKS]
-        write_results(args, update_epochs, results)
+        steps = 2048 * max(2, 100 // update_epochs)  # the peer's share of a round is about 20 s at K = 10, 40 s at 80
+        works = [Work(task, update_epochs, steps) for task in TASKS]
+        results = [measure(work, ppo_contenders(work), args.rounds) for work in works]
+        write_results(args, f"ppo_k{update_epochs}", f" --update-epochs {update_epochs}", results)
+
+
+def time_apple(args: Args) -> None:
+    game = {"AppleGame-v0, 4,096 games side by side": time_game(4096, 1_000, args.rounds)}
+    work = Work("AppleGame-v0", None, 50_000)
+    write_results(args, "apple", "", [measure(work, dqn_contenders(work), args.rounds)], game)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[name] = "1"  # before numpy is imported
+    arguments = tyro.cli(Args)
+    {"ppo": time_ppo, "apple": time_apple}[arguments.what](arguments)

@@ -1105,19 +1105,22 @@ def start_wandb(args: Args, run_dir: Path) -> None:
 class Means:
     """Means of the metrics of the updates since the last row of updates.csv."""
 
-    def __init__(self, device: torch.device):
-        self.sums, self.count = torch.zeros(2, device=device), 0
+    def __init__(self):
+        self.td_error = self.q_value = 0.0
+        self.count = 0
 
     def add(self, parts: tuple[torch.Tensor, ...]) -> None:
-        self.sums[0] += parts[0]
-        self.sums[1] += parts[1]
+        self.td_error += parts[0].item()
+        self.q_value += parts[1].item()
         self.count += 1
 
     def take(self) -> dict[str, float]:
-        td_error, q_value = (self.sums / max(1, self.count)).tolist()
-        updates, self.count = self.count, 0
-        self.sums.zero_()
-        return {"charts/updates": updates, "losses/td_error": td_error, "losses/q_values": q_value}
+        """The means so far, and begin anew."""
+        count = max(1, self.count)
+        means = {"losses/td_error": self.td_error / count, "losses/q_values": self.q_value / count}
+        metrics = {"charts/updates": self.count, **means}
+        self.__init__()
+        return metrics
 
 
 def main(args: Args) -> int:
@@ -1155,7 +1158,7 @@ def main(args: Args) -> int:
     players = [Player(Episode(env, args.seed, i, args.frame_skip), args) for i, env in enumerate(envs)]
     buffer = ReplayBuffer(run_dir / "replay.dat", args.buffer_size, 2 * args.checkpoint_interval, obs_dim)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
-    means = Means(device)
+    means = Means()
     iteration, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}
     if checkpoint is None:
         for player in players:
@@ -1166,7 +1169,7 @@ def main(args: Args) -> int:
         optimizer.load_state_dict(checkpoint["optimizer"])
         buffer.added = checkpoint["added"]
         rng.bit_generator.state = json.loads(checkpoint["rng"])
-        means.sums, means.count = checkpoint["means"]["sums"].to(device), checkpoint["means"]["count"]
+        vars(means).update(checkpoint["means"])
         same = [player.load_state_dict(state) for player, state in zip(players, checkpoint["players"])]
         if not all(same):
             print("--resume: the replayed episode differs (another machine?), goes on with it", file=sys.stderr)
@@ -1231,7 +1234,7 @@ def main(args: Args) -> int:
                 "optimizer": optimizer.state_dict(),
                 "added": buffer.sync(),
                 "rng": json.dumps(rng.bit_generator.state),
-                "means": {"sums": means.sums, "count": means.count},
+                "means": dict(vars(means)),
                 "players": [player.state_dict() for player in players],
             }
             writer.flush()

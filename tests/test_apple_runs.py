@@ -319,7 +319,9 @@ def test_a_teacher_of_another_game_is_named(teacher, tmp_path, monkeypatch, caps
 def test_a_resume_with_other_hyperparameters_names_them(kind, module, flags, request, tmp_path, capsys):
     shutil.copytree(request.getfixturevalue(kind), tmp_path / "run")
     flag, value = flags[-2:]
-    assert_refused(module, capsys, [*flags, "--run-dir", tmp_path / "run", "--resume"], [f"{flag} {float(value)}", "was"])
+    assert_refused(
+        module, capsys, [*flags, "--run-dir", tmp_path / "run", "--resume"], [f"{flag} {float(value)}", "was"]
+    )
 
 
 def test_a_resume_with_other_demonstrations_is_refused(student, tmp_path):

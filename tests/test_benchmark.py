@@ -3,6 +3,7 @@
 import csv
 import importlib.util
 import json
+import math
 import sys
 
 import numpy as np
@@ -18,7 +19,7 @@ def load(name: str):
     return module
 
 
-report, speed = load("report"), load("speed")
+report, speed, apple = load("report"), load("speed"), load("apple_report")
 
 
 def test_interval_is_that_of_the_t_test():
@@ -75,3 +76,51 @@ def test_speed_table_has_medians_and_ratios_round_by_round():
     memory = dict.fromkeys(speeds, 500.0)
     row = {"env_id": "T", "update_epochs": 10, "steps_per_second": speeds, "ratio": ratio, "peak_memory_mb": memory}
     assert "| T | 10 | plain | 400 | 3.00 | 2.00 to 4.00 | 500 |" in speed.table([row])
+
+
+def test_auc_is_the_share_of_pairs_in_order():
+    rng = np.random.default_rng(0)
+    agent, human = rng.integers(0, 6, 40), rng.integers(0, 4, 30)
+    pairs = [(a > h) + 0.5 * (a == h) for a in agent for h in human]
+    assert math.isclose(apple.auc(agent, human), np.mean(pairs))
+
+
+def test_a_player_is_told_from_another_but_not_from_itself():
+    """Players who go right or left half of the time, at random; and one who never goes left."""
+
+    def episodes(seed: int, moves: list[int]) -> list[dict]:
+        rng = np.random.default_rng(seed)
+        obs = np.zeros((601, 6), np.float32)
+        return [{"actions": rng.choice(moves, 600), "observations": obs} for _ in range(12)]
+
+    assert 0.35 < apple.tell_apart(episodes(0, [3, 5]), episodes(1, [3, 5]), 0) < 0.65
+    assert apple.tell_apart(episodes(0, [3, 5]), episodes(1, [4, 5]), 0) > 0.99
+
+
+def test_reaction_times_and_changes_of_direction():
+    apples = np.repeat([[0.1, 0.1], [0.2, 0.9], [0.7, 0.3]], [5, 10, 6], axis=0)
+    observations = np.concatenate([np.zeros((21, 2)), apples, np.zeros((21, 2))], 1)
+    actions = np.array([4] * 5 + [4] * 3 + [5] * 7 + [5] * 5)  # new apples at 5 and 15; a change at 8 alone
+    episode = {"observations": observations, "actions": actions}
+    assert apple.reaction_times([episode]) == [3]
+    assert math.isclose(apple.changes_per_second([episode]), 60 / 19)
+
+
+def test_the_rule_picks_the_smallest_alpha_that_beats_the_human():
+    curve = {0.0: [20.0, 20.0], 0.5: [12.0, 13.0], 0.8: [19.0, 18.9], 0.93: [21.0, 17.0], 1.0: [30.0, 31.0]}
+    assert apple.representative_alpha(curve, 18.71) == 0.8
+    assert apple.representative_alpha(curve, 40.0) is None
+
+
+def test_only_the_main_sweep_is_in_the_curve():
+    rows = [
+        {"kind": kind, "alpha": 0.5, "mode": mode, "mean": mean}
+        for kind, mode, mean in [("alpha0.5", "sampled", 1), ("alpha0.5", "greedy", 2), ("T0_alpha0.5", "sampled", 3)]
+    ]
+    assert apple.alpha_curve(rows, "sampled") == {0.5: [1]}
+
+
+def test_interval_of_the_seeds_is_that_of_the_t_distribution():
+    mean, half = apple.interval([1.0, 2.0, 3.0, 4.0, 5.0])
+    low, high = stats.t.interval(0.95, 4, loc=3.0, scale=math.sqrt(2.5 / 5))
+    assert math.isclose(mean - half, low) and math.isclose(mean + half, high)

@@ -1,0 +1,27 @@
+#!/usr/bin/env bash
+# The Apple game: a teacher for each seed, students over α, and the ablations; the runs behind benchmark/results/apple/.
+# Can be sent again after every stop. Two runs at a time: about 3 hours on 2 cores.
+#   benchmark/apple_alpha.sh
+#   SEEDS="1" WORKERS=1 benchmark/apple_alpha.sh
+set -euo pipefail
+cd "$(dirname "$0")/.."
+SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
+ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
+mkdir -p "$RUNS"
+for seed in $SEEDS; do
+  echo "--seed $seed --run-dir $RUNS/teacher_seed$seed"
+done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/dqn_apple.py --compile --save-model --resume
+student() { echo "--seed $1 --teacher $RUNS/teacher_seed$1 --alpha $2 --run-dir $RUNS/$3_seed$1 ${*:4}"; }
+{
+  for seed in $SEEDS; do
+    for alpha in $ALPHAS; do student "$seed" "$alpha" "alpha$alpha"; done
+  done
+  for seed in $SEEDS; do
+    for temperature in 0 0.1 0.5 1 2; do
+      for alpha in 0.5 0.93 1.0; do student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"; done
+    done
+    for alpha in 0.5 0.93 1.0; do student "$seed" "$alpha" "own_alpha$alpha" --states own; done
+    for alpha in 0.0 0.93; do student "$seed" "$alpha" "episode_alpha$alpha" --split episode; done
+  done
+} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --compile --save-model --resume
+"$PYTHON" benchmark/apple_report.py --runs "$RUNS"

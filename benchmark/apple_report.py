@@ -1,0 +1,332 @@
+"""The Apple game's runs -> Table 2.1, Fig. 2.4, the ablations and a first measure of human-likeness.
+
+    python benchmark/apple_report.py        # runs/apple -> benchmark/results/apple
+
+Takes whatever part of the runs of `benchmark/apple_alpha.sh` is done, and says which. Intervals are 95% t-intervals of
+the seeds' means; each mean is over 400 episodes.
+"""
+
+import csv
+import importlib.util
+import json
+import re
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+import tyro
+from matplotlib.figure import Figure
+from scipy import stats
+
+ROOT = Path(__file__).resolve().parent.parent
+PUBLISHED = {  # Table 2.1: max, min, avg, std
+    "human": (27, 11, 18.71, 2.86),
+    "DQN": (53, 15, 36.27, 5.44),
+    "BC, α = 0": (29, 3, 17.57, 4.37),
+    "hybrid, α = 0.93": (35, 11, 22.02, 3.70),
+}
+CLIP = 60  # frames: 1 s
+
+
+@dataclass
+class Args:
+    runs: Path = Path("runs/apple")
+    """folder of the runs' folders"""
+    out: Path = ROOT / "benchmark" / "results" / "apple"
+    """folder for tables and figures"""
+    likeness_episodes: int = 40
+    """episodes of each agent and seed for the measure of human-likeness, half of them held out"""
+
+
+def load_method(name: str):
+    spec = importlib.util.spec_from_file_location(name, ROOT / "cleanrl_thesis" / f"{name}.py")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def read_runs(folder: Path) -> list[dict]:
+    """One row for every finished run: what it was and what it scored."""
+    rows = []
+    for path in sorted(folder.glob("*/result.json")):
+        result, args = json.loads(path.read_text()), json.loads((path.parent / "args.json").read_text())
+        kind = re.sub(r"_seed\d+$", "", path.parent.name)
+        if not result["complete"]:
+            continue
+        evaluations = result["evaluation"] if "sampled" in result["evaluation"] else {"greedy": result["evaluation"]}
+        for mode, numbers in evaluations.items():
+            rows.append(
+                {
+                    "kind": kind,
+                    "seed": result["seed"],
+                    "alpha": args.get("alpha", ""),
+                    "temperature": args.get("temperature", ""),
+                    "mode": mode,
+                    **{name: round(numbers[name], 3) for name in ("mean", "std", "min", "max")},
+                    "test_accuracy_rl": round(result.get("test", {}).get("accuracy_rl", np.nan), 4),
+                    "test_accuracy_human": round(result.get("test", {}).get("accuracy_human", np.nan), 4),
+                    "steps": result["global_step"],
+                    "training_seconds": round(result["training_seconds"]),
+                }
+            )
+    return rows
+
+
+def select(rows: list[dict], kind: str, mode: str) -> list[dict]:
+    return [row for row in rows if row["kind"] == kind and row["mode"] == mode]
+
+
+def interval(values: list[float]) -> tuple[float, float]:
+    """Mean and half width of its 95% t-interval; nan of a single value."""
+    if len(values) < 2:
+        return float(np.mean(values)) if values else np.nan, np.nan
+    return float(np.mean(values)), float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
+
+
+def with_interval(values: list[float], digits: int = 2) -> str:
+    mean, half = interval(values)
+    return f"{mean:.{digits}f}" + ("" if np.isnan(half) else f" ± {half:.{digits}f}")
+
+
+def human_rows(method, seeds: list[int]) -> list[dict]:
+    """400 episodes of the synthetic human for each seed."""
+    rows = []
+    for seed in seeds:
+        games = [method.episode_seed(seed, method.EVALUATION_STREAM, i) for i in range(400)]
+        episodes = method.play(method.SyntheticHuman(400, seed), "AppleGame-v0", games)
+        scores = [episode["rewards"].sum() for episode in episodes]
+        rows.append({"mean": np.mean(scores), "std": np.std(scores), "min": min(scores), "max": max(scores)})
+    return rows
+
+
+def table_2_1(rows: list[dict], human: list[dict]) -> str:
+    """Table 2.1, published beside measured."""
+    lines = ["| agent | | seeds | max | min | avg | std |", "|---|---|---|---|---|---|---|"]
+    measured = {
+        "human": [("synthetic human", human)],
+        "DQN": [("measured", select(rows, "teacher", "greedy"))],
+        "BC, α = 0": [(mode, select(rows, "alpha0.0", mode)) for mode in ("sampled", "greedy")],
+        "hybrid, α = 0.93": [(mode, select(rows, "alpha0.93", mode)) for mode in ("sampled", "greedy")],
+        "distilled DQN, α = 1": [(mode, select(rows, "alpha1.0", mode)) for mode in ("sampled", "greedy")],
+    }
+    for agent, groups in measured.items():
+        if agent in PUBLISHED:
+            lines.append(f"| {agent} | published | 1 | {' | '.join(map(str, PUBLISHED[agent]))} |")
+        for name, group in groups:
+            if group:
+                columns = [[row[key] for row in group] for key in ("max", "min", "mean", "std")]
+                cells = [f"{np.mean(columns[0]):.0f}", f"{np.mean(columns[1]):.0f}", *map(with_interval, columns[2:])]
+                lines.append(f"| {agent} | {name} | {len(group)} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def alpha_curve(rows: list[dict], mode: str) -> dict[float, list[float]]:
+    """The seeds' mean scores for each α of the main sweep."""
+    curve = defaultdict(list)
+    for row in rows:
+        if row["mode"] == mode and re.fullmatch(r"alpha[\d.]+", row["kind"]):
+            curve[row["alpha"]].append(row["mean"])
+    return dict(sorted(curve.items()))
+
+
+def representative_alpha(curve: dict[float, list[float]], human: float) -> float | None:
+    """The thesis' rule: the smallest α tried above 0 whose score is better than the human's."""
+    better = [alpha for alpha, scores in curve.items() if alpha > 0 and np.mean(scores) > human]
+    return min(better) if better else None
+
+
+def alpha_table(rows: list[dict], human: float) -> str:
+    lines = ["| α | seeds | sampled | greedy |", "|---|---|---|---|"]
+    sampled, greedy = alpha_curve(rows, "sampled"), alpha_curve(rows, "greedy")
+    for alpha in sampled:
+        cells = (alpha, len(sampled[alpha]), with_interval(sampled[alpha]), with_interval(greedy[alpha]))
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    rule = representative_alpha(sampled, human)
+    lines += [
+        "",
+        f"The rule of the thesis (smallest α tried that beats the human) picks {rule} here; it picked 0.93 there.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def ablation_table(rows: list[dict]) -> str:
+    """The other temperatures, states and splits beside the main sweep."""
+    lines = ["| runs | seeds | sampled | greedy | agrees with DQN | with human |", "|---|---|---|---|---|---|"]
+    for kind in sorted({row["kind"] for row in rows if row["mode"] == "sampled"}):
+        sampled, greedy = select(rows, kind, "sampled"), select(rows, kind, "greedy")
+        columns = [[row["mean"] for row in sampled], [row["mean"] for row in greedy]]
+        agreement = [[row[f"test_accuracy_{name}"] for row in sampled] for name in ("rl", "human")]
+        cells = [kind, len(sampled), *map(with_interval, columns), *(with_interval(column, 3) for column in agreement)]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"
+
+
+def figure_2_4(rows: list[dict], human: float) -> Figure:
+    figure = Figure(figsize=(7, 4.4), layout="constrained")
+    axes = figure.subplots()
+    for mode, colour in (("sampled", "C0"), ("greedy", "C1")):
+        curve = alpha_curve(rows, mode)
+        means, halves = np.array([interval(scores) for scores in curve.values()]).T
+        axes.plot(list(curve), means, "o-", color=colour, markersize=4, label=f"student, {mode}")
+        axes.fill_between(
+            list(curve), means - np.nan_to_num(halves), means + np.nan_to_num(halves), color=colour, alpha=0.2
+        )
+    teacher, _ = interval([row["mean"] for row in select(rows, "teacher", "greedy")])
+    axes.axhline(teacher, color="C3", linestyle="--", label="DQN")
+    axes.axhline(human, color="C2", linestyle="--", label="synthetic human")
+    published = {0.0: PUBLISHED["BC, α = 0"][2], 0.93: PUBLISHED["hybrid, α = 0.93"][2]}
+    axes.plot(list(published), list(published.values()), "k*", markersize=9, label="published (Table 2.1)")
+    axes.set(
+        xlabel="α, weight of the DQN", ylabel="apples in 30 s, mean of 400 episodes", title="Fig. 2.4: score over α"
+    )
+    axes.set_ylim(bottom=0)
+    axes.legend(fontsize="small")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Human-likeness without people
+# ---------------------------------------------------------------------------------------------------------------------
+def load_student(method, folder: Path):
+    with safetensors.safe_open(folder / "model.safetensors", "pt") as file:
+        args = json.loads(file.metadata()["args"])
+    student = method.Student(6, 9, args["hidden_size"])
+    student.load_state_dict(safetensors.torch.load_file(folder / "model.safetensors"))
+    return student
+
+
+def agents_of(method, folder: Path, seed: int, episodes: int) -> dict[str, list[dict]]:
+    """Episodes of each agent of a seed that is there; the second human is as good as an agent can look."""
+    seeds = [method.episode_seed(seed, method.DEMONSTRATION_STREAM, i) for i in range(episodes)]
+    policies = {
+        "human": method.SyntheticHuman(episodes, seed),
+        "human again": method.SyntheticHuman(episodes, seed + 1000),
+    }
+    if (folder / f"teacher_seed{seed}" / "result.json").exists():
+        teacher = method.load_teacher(folder / f"teacher_seed{seed}", "AppleGame-v0")
+        policies["DQN"] = method.numpy_greedy(teacher)
+    for alpha in ("0.0", "0.5", "0.8", "0.93", "1.0"):
+        run = folder / f"alpha{alpha}_seed{seed}"
+        if (run / "result.json").exists():
+            student = load_student(method, run)
+            for mode in ("sampled", "greedy"):
+                policies[f"α = {alpha}, {mode}"] = method.numpy_policy(student, mode, seed)
+    return {name: method.play(policy, "AppleGame-v0", seeds, keep=True) for name, policy in policies.items()}
+
+
+def clips(episodes: list[dict]) -> tuple[torch.Tensor, np.ndarray]:
+    """Seconds of play as (clips, channels, frames), with the number of the episode each is from.
+
+    Channels: which of the nine actions, and the way to the apple.
+    """
+    seconds, numbers = [], []
+    for number, episode in enumerate(episodes):
+        actions = F.one_hot(torch.from_numpy(episode["actions"].astype(np.int64)), 9).float()
+        frames = torch.cat([actions, torch.from_numpy(episode["observations"][:-1, 4:])], 1)
+        seconds += frames[: len(frames) // CLIP * CLIP].split(CLIP)
+        numbers += [number] * (len(frames) // CLIP)
+    return torch.stack(seconds).transpose(1, 2), np.array(numbers)
+
+
+def auc(positive: np.ndarray, negative: np.ndarray) -> float:
+    """Probability that a score of the first kind is above one of the second."""
+    return stats.mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative))
+
+
+def tell_apart(human: list[dict], agent: list[dict], seed: int) -> float:
+    """AUC on clips of held-out episodes of a classifier that learned to tell the agent from the human on the others."""
+    (human_clips, numbers), (agent_clips, _) = clips(human), clips(agent)
+    training = torch.from_numpy(numbers < len(human) // 2)
+    x = torch.cat([human_clips[training], agent_clips[training]])
+    y = torch.cat([torch.zeros(int(training.sum())), torch.ones(int(training.sum()))])
+    torch.manual_seed(seed)
+    network = nn.Sequential(
+        *(nn.Conv1d(11, 32, 5), nn.ReLU(), nn.Conv1d(32, 32, 5, stride=2), nn.ReLU()),
+        *(nn.AdaptiveAvgPool1d(4), nn.Flatten(), nn.Linear(128, 32), nn.ReLU(), nn.Linear(32, 1)),
+    )
+    optimizer = torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-4)
+    for _ in range(12):
+        for rows in torch.randperm(len(x)).split(64):
+            loss = F.binary_cross_entropy_with_logits(network(x[rows]).squeeze(1), y[rows])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    with torch.no_grad():
+        scores = [network(kind[~training]).squeeze(1).numpy() for kind in (agent_clips, human_clips)]
+    return auc(*scores)
+
+
+def reaction_times(episodes: list[dict]) -> list[int]:
+    """Frames from an apple's appearance to the first change of action, for apples that are there for so long."""
+    times = []
+    for episode in episodes:
+        apples, actions = episode["observations"][:-1, 2:4], episode["actions"]
+        appears = np.flatnonzero((apples[1:] != apples[:-1]).any(1)) + 1
+        changes = np.flatnonzero(actions[1:] != actions[:-1]) + 1
+        following = np.append(appears[1:], len(actions))
+        first = np.append(changes, len(actions))[np.searchsorted(changes, appears)]
+        times += (first - appears)[first < following].tolist()
+    return times
+
+
+def changes_per_second(episodes: list[dict]) -> float:
+    return float(np.mean([np.mean(e["actions"][1:] != e["actions"][:-1]) for e in episodes]) * CLIP)
+
+
+def likeness_table(method, folder: Path, seeds: list[int], episodes: int) -> str:
+    """How well each agent is told from the synthetic human, and two numbers that people named."""
+    measures = defaultdict(lambda: defaultdict(list))
+    for seed in seeds:
+        agents = agents_of(method, folder, seed, episodes)
+        for name, played in agents.items():
+            if name != "human":
+                measures[name]["auc"].append(tell_apart(agents["human"], played, seed))
+            measures[name]["score"].append(float(np.mean([episode["rewards"].sum() for episode in played])))
+            measures[name]["reaction"].append(float(np.median(reaction_times(played))) / CLIP * 1000)
+            measures[name]["changes"].append(changes_per_second(played))
+    lines = [
+        "| agent | seeds | told from the human, AUC | reaction, ms (median) | changes of direction per s | score |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, values in measures.items():
+        told = with_interval(values["auc"], 3) if values["auc"] else ""
+        cells = (len(values["score"]), told, with_interval(values["reaction"], 0), with_interval(values["changes"], 1))
+        lines.append(f"| {name} | {' | '.join(map(str, cells))} | {with_interval(values['score'], 1)} |")
+    return "\n".join(lines) + "\n"
+
+
+def main(args: Args) -> None:
+    torch.set_num_threads(1)
+    rows = read_runs(args.runs)
+    if not rows:
+        raise SystemExit(f"--runs {args.runs}: holds no finished run")
+    method = load_method("distill_hybrid")
+    seeds = sorted({row["seed"] for row in rows})
+    human = human_rows(method, seeds)
+    human_score = float(np.mean([row["mean"] for row in human]))
+    args.out.mkdir(parents=True, exist_ok=True)
+    with open(args.out / "runs.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    folders = {(row["kind"], row["seed"]) for row in rows}
+    hours = sum(row["training_seconds"] for row in rows if row["mode"] == "greedy") / 3600
+    text = f"{len(folders)} runs, {hours:.1f} core-hours of training, seeds {', '.join(map(str, seeds))}.\n\n"
+    text += f"## Table 2.1\n\n{table_2_1(rows, human)}\n## Score over α\n\n{alpha_table(rows, human_score)}\n"
+    text += f"## Temperature, states and split\n\n{ablation_table(rows)}\n"
+    text += f"## Human-likeness without people\n\n{likeness_table(method, args.runs, seeds, args.likeness_episodes)}"
+    (args.out / "table.md").write_text(text)
+    figure_2_4(rows, human_score).savefig(args.out / "fig_2_4.png", dpi=130)
+    print(text)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
