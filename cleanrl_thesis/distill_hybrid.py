@@ -539,13 +539,15 @@ def make_human_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
 
 
 class QNetwork(nn.Module):
-    """Q(s, ·) of each action: a trunk of 64-64, then one linear head, or with `dueling` V(s) + A(s, ·) − mean A."""
+    """Q(s, ·) of each action: a trunk of two layers, then one linear head, or with `dueling` V(s) + A(s, ·) − mean A."""
 
-    def __init__(self, obs_dim: int, num_actions: int, dueling: bool):
+    def __init__(self, obs_dim: int, num_actions: int, hidden_size: int, dueling: bool):
         super().__init__()
-        self.trunk = nn.Sequential(nn.Linear(obs_dim, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU())
-        self.advantage = nn.Linear(64, num_actions)
-        self.value = nn.Linear(64, 1) if dueling else None
+        self.trunk = nn.Sequential(
+            *(nn.Linear(obs_dim, hidden_size), nn.ReLU(), nn.Linear(hidden_size, hidden_size), nn.ReLU())
+        )
+        self.advantage = nn.Linear(hidden_size, num_actions)
+        self.value = nn.Linear(hidden_size, 1) if dueling else None
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Observations (B, O) -> action values (B, A)."""
@@ -585,13 +587,13 @@ def load_teacher(folder: Path, env_id: str) -> QNetwork:
         with safetensors.safe_open(path, "pt") as file:
             args = json.loads(file.metadata()["args"])
         tensors = safetensors.torch.load_file(path)
-        trained_on, dueling = args["env_id"], args["dueling"]
+        trained_on, hidden_size, dueling = args["env_id"], args["hidden_size"], args["dueling"]
     except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"--teacher {path}: is no model of dqn_apple.py: {first_line(error)}") from None
     same_game = trained_on.split(":")[-1] == env_id.split(":")[-1]
     require(same_game, "--teacher", folder, f"was trained on {trained_on}, --env-id is {env_id}")
     env = make_env(env_id)
-    teacher = QNetwork(env.observation_space.shape[0], int(env.action_space.n), dueling)
+    teacher = QNetwork(env.observation_space.shape[0], int(env.action_space.n), hidden_size, dueling)
     try:
         teacher.load_state_dict(tensors)
     except RuntimeError as error:

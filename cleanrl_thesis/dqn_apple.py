@@ -124,6 +124,10 @@ class Args:
     """frames for which an action is repeated"""
     learning_rate: float = 5e-4
     """Adam's learning rate (Baselines)"""
+    anneal_lr: bool = True
+    """anneal the learning rate linearly to 0; off: constant (Baselines)"""
+    hidden_size: int = 64
+    """units in each of the two hidden layers (Baselines)"""
     buffer_size: int = 200_000
     """transitions in the replay buffer (section 2.4.1)"""
     gamma: float = 0.99
@@ -191,7 +195,7 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
-    counts = "num_threads num_envs frame_skip batch_size buffer_size eval_episodes checkpoint_interval stop_at n_step"
+    counts = "num_threads num_envs frame_skip batch_size buffer_size eval_episodes checkpoint_interval stop_at n_step hidden_size"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("train_frequency target_network_frequency", lambda x: x >= 1, "must be at least 1"),
@@ -397,13 +401,15 @@ def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
 # Network
 # ---------------------------------------------------------------------------------------------------------------------
 class QNetwork(nn.Module):
-    """Q(s, ·) of each action: a trunk of 64-64, then one linear head, or with `dueling` V(s) + A(s, ·) − mean A."""
+    """Q(s, ·) of each action: a trunk of two layers, then one linear head, or with `dueling` V(s) + A(s, ·) − mean A."""
 
-    def __init__(self, obs_dim: int, num_actions: int, dueling: bool):
+    def __init__(self, obs_dim: int, num_actions: int, hidden_size: int, dueling: bool):
         super().__init__()
-        self.trunk = nn.Sequential(nn.Linear(obs_dim, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU())
-        self.advantage = nn.Linear(64, num_actions)
-        self.value = nn.Linear(64, 1) if dueling else None
+        self.trunk = nn.Sequential(
+            *(nn.Linear(obs_dim, hidden_size), nn.ReLU(), nn.Linear(hidden_size, hidden_size), nn.ReLU())
+        )
+        self.advantage = nn.Linear(hidden_size, num_actions)
+        self.value = nn.Linear(hidden_size, 1) if dueling else None
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Observations (B, O) -> action values (B, A)."""
@@ -638,19 +644,25 @@ class FlatAdam:
     One vector is clipped and stepped faster than a dozen tensors, and copied at once into the target network.
     """
 
-    def __init__(self, agent: QNetwork, target_network: QNetwork):
+    def __init__(self, agent: QNetwork, target_network: QNetwork, learning_rate: float):
+        self.initial_rate = learning_rate
         self.parameters = list(agent.parameters())
         self.shapes = [parameter.shape for parameter in self.parameters]
         self.vector = torch.cat([parameter.detach().reshape(-1) for parameter in self.parameters])
         self.target = self.vector.clone()
         self.gradient, self.mean, self.square = (torch.zeros_like(self.vector) for _ in range(3))
         self.step = torch.zeros((), device=self.vector.device)
+        self.rate = torch.full_like(self.step, learning_rate)
         for parameter, value, gradient in zip(
             self.parameters, views(self.vector, self.shapes), views(self.gradient, self.shapes)
         ):
             parameter.data, parameter.grad = value, gradient
         for parameter, value in zip(target_network.parameters(), views(self.target, self.shapes)):
             parameter.data = value
+
+    def anneal(self, remaining: float) -> None:
+        """Set the learning rate to a share of the initial one."""
+        self.rate.fill_(self.initial_rate * remaining)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         names = ("vector", "target", "mean", "square", "step")
@@ -679,7 +691,7 @@ class PlainUpdate:
 
     def __init__(self, agent: QNetwork, target_network: QNetwork, optimizer: FlatAdam, args: Args):
         self.agent, self.target_network, self.optimizer = agent, target_network, optimizer
-        self.double, self.learning_rate, self.max_grad_norm = args.double, args.learning_rate, args.max_grad_norm
+        self.double, self.max_grad_norm = args.double, args.max_grad_norm
 
     def __call__(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Change the agent and the optimiser by the replay buffer's rows; return the TD error's size and the mean Q."""
@@ -692,11 +704,11 @@ class PlainUpdate:
         adam.gradient.zero_()
         loss.backward()
         with torch.no_grad():
-            self.adam_step(adam.vector, adam.mean, adam.square, adam.step, adam.gradient)
+            self.adam_step(adam.vector, adam.mean, adam.square, adam.step, adam.rate, adam.gradient)
         return parts
 
-    def adam_step(self, vector, mean, square, step, gradient) -> None:
-        adam_step(vector, mean, square, step, self.learning_rate, gradient, self.max_grad_norm, 1e-8)
+    def adam_step(self, vector, mean, square, step, rate, gradient) -> None:
+        adam_step(vector, mean, square, step, rate, gradient, self.max_grad_norm, 1e-8)
 
 
 class CompiledUpdate(PlainUpdate):
@@ -705,7 +717,7 @@ class CompiledUpdate(PlainUpdate):
     def __init__(self, agent: QNetwork, target_network: QNetwork, optimizer: FlatAdam, args: Args):
         super().__init__(agent, target_network, optimizer, args)
         self.names = [name for name, _ in agent.named_parameters()]
-        self.variables = (optimizer.vector, optimizer.mean, optimizer.square, optimizer.step)
+        self.variables = (optimizer.vector, optimizer.mean, optimizer.square, optimizer.step, optimizer.rate)
         self.compiled = torch.compile(self.step, options={"cpp_wrapper": True})  # kernels called from C++: saves 25 µs
         example = optimizer.vector.new_zeros(args.batch_size, 2 * agent.trunk[0].in_features + 3)
         torch.compiler.set_stance("default")
@@ -721,12 +733,12 @@ class CompiledUpdate(PlainUpdate):
     def loss(self, vector: torch.Tensor, minibatch: Minibatch, target: torch.Tensor):
         return dqn_loss(self.q_values(vector, minibatch.obs), minibatch, target)
 
-    def step(self, vector, mean, square, step, target_vector, rows) -> tuple[torch.Tensor, ...]:
+    def step(self, vector, mean, square, step, rate, target_vector, rows) -> tuple[torch.Tensor, ...]:
         minibatch = Minibatch.unpack(rows)
         online_q = self.q_values(vector, minibatch.next_obs) if self.double else None
         target = td_target(minibatch, self.q_values(target_vector, minibatch.next_obs), online_q)
         gradient, parts = torch.func.grad(self.loss, has_aux=True)(vector, minibatch, target)
-        self.adam_step(vector, mean, square, step, gradient)
+        self.adam_step(vector, mean, square, step, rate, gradient)
         return parts
 
     def __call__(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -1152,9 +1164,9 @@ def main(args: Args) -> int:
     stop = StopSignal()
 
     obs_dim, num_actions = envs[0].observation_space.shape[0], int(envs[0].action_space.n)
-    agent = QNetwork(obs_dim, num_actions, args.dueling).to(device)
-    target_network = QNetwork(obs_dim, num_actions, args.dueling).to(device)
-    optimizer = FlatAdam(agent, target_network)
+    agent = QNetwork(obs_dim, num_actions, args.hidden_size, args.dueling).to(device)
+    target_network = QNetwork(obs_dim, num_actions, args.hidden_size, args.dueling).to(device)
+    optimizer = FlatAdam(agent, target_network, args.learning_rate)
     players = [Player(Episode(env, args.seed, i, args.frame_skip), args) for i, env in enumerate(envs)]
     buffer = ReplayBuffer(run_dir / "replay.dat", args.buffer_size, 2 * args.checkpoint_interval, obs_dim)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
@@ -1204,6 +1216,7 @@ def main(args: Args) -> int:
         before, global_step = global_step, global_step + frames_per_step
 
         if buffer.added >= args.batch_size and global_step >= args.learning_starts:
+            optimizer.anneal(1.0 - before / args.total_timesteps if args.anneal_lr else 1.0)
             for _ in range(global_step // args.train_frequency - before // args.train_frequency):
                 means.add(update(buffer.sample(args.batch_size, rng).to(device)))
             if args.cuda:

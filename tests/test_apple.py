@@ -209,7 +209,7 @@ def test_loss_is_hubers_on_the_taken_action():
 
 
 def test_dueling_heads_have_the_value_as_mean():
-    network = dqn.QNetwork(6, 9, dueling=True)
+    network = dqn.QNetwork(6, 9, 64, dueling=True)
     obs = torch.rand(5, 6)
     with torch.no_grad():
         assert torch.allclose(network(obs).mean(1), network.value(network.trunk(obs)).squeeze(1), atol=1e-6)
@@ -217,7 +217,7 @@ def test_dueling_heads_have_the_value_as_mean():
 
 @pytest.mark.parametrize("dueling", [True, False])
 def test_numpy_policy_is_the_networks(dueling):
-    network = dqn.QNetwork(6, 9, dueling)
+    network = dqn.QNetwork(6, 9, 64, dueling)
     obs = torch.rand(200, 6)
     assert dqn.numpy_greedy(network)(obs.numpy()).tolist() == network(obs).argmax(1).tolist()
 
@@ -225,8 +225,8 @@ def test_numpy_policy_is_the_networks(dueling):
 def make_update(**settings):
     torch.manual_seed(0)
     args = dqn.complete_args(dqn.Args(**settings))
-    agent, target = dqn.QNetwork(6, 9, args.dueling), dqn.QNetwork(6, 9, args.dueling)
-    optimizer = dqn.FlatAdam(agent, target)
+    agent, target = dqn.QNetwork(6, 9, 64, args.dueling), dqn.QNetwork(6, 9, 64, args.dueling)
+    optimizer = dqn.FlatAdam(agent, target, args.learning_rate)
     return agent, target, optimizer, dqn.make_update(agent, target, optimizer, args)
 
 
@@ -234,7 +234,7 @@ def make_update(**settings):
 def test_update_is_torchs_adam_on_the_loss(double):
     """Five steps beside torch.optim.Adam, clip_grad_norm_ and a loss that is written anew."""
     agent, target, optimizer, update = make_update(double=double, max_grad_norm=0.1)
-    peer = dqn.QNetwork(6, 9, True)
+    peer = dqn.QNetwork(6, 9, 64, True)
     peer.load_state_dict(agent.state_dict())
     adam = torch.optim.Adam(peer.parameters(), 5e-4, eps=1e-8)
     for _ in range(5):

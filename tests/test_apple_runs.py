@@ -302,7 +302,7 @@ def test_a_teacher_of_another_game_is_named(teacher, tmp_path, monkeypatch, caps
     tensors = safetensors.torch.load_file(teacher / "model.safetensors")
     for metadata, words in (
         ({"args": json.dumps({"env_id": "ALE/Gopher-v5", "dueling": True})}, ["ALE/Gopher-v5", "AppleGame-v0"]),
-        ({"args": json.dumps({"env_id": "AppleGame-v0", "dueling": False})}, ["another shape"]),
+        ({"args": json.dumps({"env_id": "AppleGame-v0", "dueling": False, "hidden_size": 64})}, ["another shape"]),
         ({}, ["no model of dqn_apple.py"]),
     ):
         safetensors.torch.save_file(tensors, "model.safetensors", metadata)
