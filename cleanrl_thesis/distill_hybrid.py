@@ -1118,24 +1118,6 @@ def start_wandb(args: Args, run_dir: Path) -> None:
     )
 
 
-class Means:
-    """Means of the metrics of the updates since the last row of updates.csv."""
-
-    def __init__(self, device: torch.device):
-        self.sums, self.count = torch.zeros(2, device=device), 0
-
-    def add(self, parts: tuple[torch.Tensor, ...]) -> None:
-        self.sums[0] += parts[0]
-        self.sums[1] += parts[1]
-        self.count += 1
-
-    def take(self) -> dict[str, float]:
-        td_error, q_value = (self.sums / max(1, self.count)).tolist()
-        updates, self.count = self.count, 0
-        self.sums.zero_()
-        return {"charts/updates": updates, "losses/td_error": td_error, "losses/q_values": q_value}
-
-
 def read_human(args: Args) -> tuple[list[dict[str, np.ndarray]], str]:
     """The human's episodes, and a fingerprint of them. Raises UsageError."""
     episodes = make_human_demonstrations(args) if args.demos is None else read_demonstrations(args.demos, args.env_id)
