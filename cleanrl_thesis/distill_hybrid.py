@@ -586,17 +586,17 @@ def load_teacher(folder: Path, env_id: str) -> QNetwork:
     try:
         with safetensors.safe_open(path, "pt") as file:
             args = json.loads(file.metadata()["args"])
-        tensors = safetensors.torch.load_file(path)
-        trained_on, hidden_size, dueling = args["env_id"], args["hidden_size"], args["dueling"]
+        trained_on = args["env_id"]
     except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"--teacher {path}: is no model of dqn_apple.py: {first_line(error)}") from None
     same_game = trained_on.split(":")[-1] == env_id.split(":")[-1]
     require(same_game, "--teacher", folder, f"was trained on {trained_on}, --env-id is {env_id}")
     env = make_env(env_id)
-    teacher = QNetwork(env.observation_space.shape[0], int(env.action_space.n), hidden_size, dueling)
     try:
-        teacher.load_state_dict(tensors)
-    except RuntimeError as error:
+        shape = env.observation_space.shape[0], int(env.action_space.n), args["hidden_size"]
+        teacher = QNetwork(*shape, args["dueling"])
+        teacher.load_state_dict(safetensors.torch.load_file(path))
+    except (safetensors.SafetensorError, KeyError, RuntimeError) as error:
         raise UsageError(f"--teacher {path}: its network has another shape: {first_line(error)}") from None
     return teacher
 
@@ -1118,16 +1118,13 @@ def start_wandb(args: Args, run_dir: Path) -> None:
     )
 
 
-def read_human(args: Args) -> tuple[list[dict[str, np.ndarray]], str]:
-    """The human's episodes, and a fingerprint of them. Raises UsageError."""
+def read_human(args: Args) -> list[dict[str, np.ndarray]]:
+    """The human's episodes. Raises UsageError."""
     episodes = make_human_demonstrations(args) if args.demos is None else read_demonstrations(args.demos, args.env_id)
     available = sum(len(episode["actions"]) for episode in episodes)
     flag = "--demo-frames" if args.demos is None else f"--demos {args.demos}: --demo-frames"
     require(available >= args.demo_frames, flag, args.demo_frames, f"there are only {available}")
-    digest = hashlib.sha256()
-    for episode in episodes:
-        digest.update(episode["observations"].tobytes() + episode["actions"].tobytes())
-    return episodes, digest.hexdigest()
+    return episodes
 
 
 def label_frames(human: Frames, teacher: QNetwork | None, args: Args) -> Data:
@@ -1145,6 +1142,14 @@ def label_frames(human: Frames, teacher: QNetwork | None, args: Args) -> Data:
         rl_obs = torch.from_numpy(join_frames(episodes, len(he_obs)).obs)
     with torch.no_grad():
         return Data(rl_obs, soft_labels(teacher(rl_obs), args.temperature), he_obs, he_actions)
+
+
+def fingerprint(data: Data) -> str:
+    """SHA-256 of all that is learned from: demonstrations, and the teacher's labels."""
+    digest = hashlib.sha256()
+    for column in data:
+        digest.update(column.numpy().tobytes())
+    return digest.hexdigest()
 
 
 def train_epoch(update: Update, training: Data, args: Args) -> dict[str, float]:
@@ -1167,7 +1172,10 @@ def main(args: Args) -> int:
     if args.capture_video:
         check_video(args.env_id)
     teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id)
-    human_episodes, fingerprint = read_human(args)
+    human_episodes = read_human(args)
+    torch.set_num_threads(args.num_threads)
+    human = join_frames(human_episodes, args.demo_frames)
+    data = label_frames(human, teacher, args)
     run_dir, checkpoint = open_run_dir(args)
     last_epoch = min(args.epochs, args.stop_at)
     if is_done(run_dir, args, last_epoch):
@@ -1175,8 +1183,8 @@ def main(args: Args) -> int:
         return 0
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
-    same_data = checkpoint is None or checkpoint["demonstrations"] == fingerprint
-    require(same_data, "--resume", run_dir, "the human's demonstrations are no longer those that the run began with")
+    same_data = checkpoint is None or checkpoint["data"] == fingerprint(data)
+    require(same_data, "--resume", run_dir, "demonstrations or teacher are no longer those that the run began with")
     write_json(run_dir / "args.json", arguments(args))
     (run_dir / "result.json").unlink(missing_ok=True)
     print(run_dir)
@@ -1188,14 +1196,11 @@ def main(args: Args) -> int:
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
-    torch.set_num_threads(args.num_threads)
     if args.cuda and not torch.cuda.is_available():
         print("--cuda: no GPU here, goes on with the CPU", file=sys.stderr)
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     stop = StopSignal()
 
-    human = join_frames(human_episodes, args.demo_frames)
-    data = label_frames(human, teacher, args)
     split_rng = np.random.default_rng(np.random.SeedSequence([args.seed, 0]))
     is_test = torch.from_numpy(split_frames(human.episodes, args.test_frames, args.split, split_rng))
     training, test = (Data(*(column[rows].to(device) for column in data)) for rows in (~is_test, is_test))
@@ -1237,7 +1242,7 @@ def main(args: Args) -> int:
             state = {
                 "args": arguments(args),
                 "arithmetic": arithmetic,
-                "demonstrations": fingerprint,
+                "data": fingerprint(data),
                 "epoch": epoch,
                 "training_seconds": training_seconds,
                 "offset": updates_csv.sync(),

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors
+import safetensors.torch
 import torch
 from conftest import ROOT, command, run
 
@@ -296,8 +298,6 @@ def test_too_few_demonstrations_are_named(student, tmp_path, monkeypatch, capsys
 
 
 def test_a_teacher_of_another_game_is_named(teacher, tmp_path, monkeypatch, capsys):
-    import safetensors.torch
-
     monkeypatch.chdir(tmp_path)
     tensors = safetensors.torch.load_file(teacher / "model.safetensors")
     for metadata, words in (
@@ -331,3 +331,20 @@ def test_a_resume_with_other_demonstrations_is_refused(student, tmp_path):
     rewrite(demos, lambda arrays: {**arrays, "actions": 8 - arrays["actions"]})
     done = run(*flags, "--resume", "--eval-episodes", 4, cwd=tmp_path, script=DISTILL, code=2)
     assert "--resume" in done.stderr and "demonstrations" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_resume_with_another_teacher_is_refused(student, teacher, tmp_path):
+    shutil.copytree(student, tmp_path / "run")
+    flags = [*SMALL_DISTILL, "--teacher", teacher, "--run-dir", "run", "--resume", "--eval-episodes", 4]
+    run(*flags, cwd=tmp_path, script=DISTILL)
+    model = safetensors.torch.load_file(teacher / "model.safetensors")
+    with safetensors.safe_open(teacher / "model.safetensors", "pt") as file:
+        metadata = file.metadata()
+    model["advantage.bias"] += 1.0 * torch.arange(9)
+    original = (teacher / "model.safetensors").read_bytes()
+    try:
+        safetensors.torch.save_file(model, teacher / "model.safetensors", metadata)
+        done = run(*flags[:-1], 5, cwd=tmp_path, script=DISTILL, code=2)
+    finally:
+        (teacher / "model.safetensors").write_bytes(original)
+    assert "--resume" in done.stderr and "teacher" in done.stderr and done.stderr.count("\n") == 1
