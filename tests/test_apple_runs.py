@@ -3,10 +3,13 @@
 import hashlib
 import io
 import json
+import random
 import shutil
 import signal
 import subprocess
+import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -348,3 +351,66 @@ def test_a_resume_with_another_teacher_is_refused(student, teacher, tmp_path):
     finally:
         (teacher / "model.safetensors").write_bytes(original)
     assert "--resume" in done.stderr and "teacher" in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("kind", ["teacher", "student"])
+def test_twenty_runs_killed_at_random_end_with_the_same_bytes(kind, teacher, tmp_path, request):
+    """Each is killed two or three times, at any moment from the start of Python on."""
+    whole = request.getfixturevalue(kind)
+    script, flags, records = {
+        "teacher": (DQN, SMALL_DQN, DQN_RECORDS),
+        "student": (DISTILL, [*SMALL_DISTILL, "--teacher", teacher], DISTILL_RECORDS),
+    }[kind]
+    start = time.time()
+    run(*flags, "--run-dir", "timed", cwd=tmp_path, script=script)
+    seconds = time.time() - start
+
+    def kill_and_resume(number: int) -> int:
+        rng, kills = random.Random(number), 0
+        for _ in range(rng.randint(2, 3)):
+            line = command(*flags, "--run-dir", tmp_path / f"run{number}", "--resume", script=script)
+            process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            try:
+                process.wait(timeout=rng.uniform(1.0, 1.3 * seconds))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+                kills += 1
+        run(*flags, "--run-dir", f"run{number}", "--resume", cwd=tmp_path, script=script)
+        assert_same_run(whole, tmp_path / f"run{number}", records)
+        return kills
+
+    with ThreadPoolExecutor(2) as pool:
+        kills = list(pool.map(kill_and_resume, range(20)))
+    print(f"20 runs, {sum(kills)} kills", file=sys.stderr)
+    assert sum(kills) >= 30
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_teacher_and_its_student_play_well(tmp_path):
+    """A tenth of the budget: the DQN near the shortest path (36), the student of hard labels near the DQN."""
+    flags = ["--total-timesteps", 800_000, "--compile", "--save-model", "--run-dir", "teacher"]
+    run(*flags, cwd=tmp_path, script=DQN)
+    flags = [
+        "--teacher",
+        "teacher",
+        "--alpha",
+        1,
+        "--temperature",
+        0,
+        "--epochs",
+        40,
+        "--compile",
+        "--run-dir",
+        "student",
+    ]
+    run(*flags, cwd=tmp_path, script=DISTILL)
+    results = [
+        json.loads((tmp_path / name / "result.json").read_text())["evaluation"] for name in ("teacher", "student")
+    ]
+    assert results[0]["mean"] > 30
+    assert results[1]["greedy"]["mean"] > 28
+    assert results[1]["sampled"]["mean"] > 25
