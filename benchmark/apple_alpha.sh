@@ -18,7 +18,9 @@ student() { echo "--seed $1 --teacher $RUNS/teacher_seed$1 --alpha $2 --run-dir 
   done
   for seed in $SEEDS; do
     for temperature in 0 0.1 0.5 1 2; do
-      for alpha in 0.5 0.93 1.0; do student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"; done
+      for alpha in 0.93 1.0 0.5 0.7 0.8 0.3; do
+        student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"
+      done
     done
     for alpha in 0.5 0.93 1.0; do student "$seed" "$alpha" "own_alpha$alpha" --states own; done
     for alpha in 0.0 0.93; do student "$seed" "$alpha" "episode_alpha$alpha" --split episode; done

@@ -127,13 +127,18 @@ def table_2_1(rows: list[dict], human: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def alpha_curve(rows: list[dict], mode: str) -> dict[float, list[float]]:
-    """The seeds' mean scores for each α of the main sweep."""
+def alpha_curve(rows: list[dict], mode: str, temperature: float = 0.01) -> dict[float, list[float]]:
+    """The seeds' mean scores for each α at a temperature, which α = 0 does not depend on."""
     curve = defaultdict(list)
     for row in rows:
-        if row["mode"] == mode and re.fullmatch(r"alpha[\d.]+", row["kind"]):
+        is_swept = re.fullmatch(r"(T[\d.]+_)?alpha[\d.]+", row["kind"]) and row["mode"] == mode
+        if is_swept and (row["temperature"] == temperature or row["alpha"] == 0):
             curve[row["alpha"]].append(row["mean"])
     return dict(sorted(curve.items()))
+
+
+def temperatures(rows: list[dict]) -> list[float]:
+    return sorted({row["temperature"] for row in rows if row["temperature"] != ""})
 
 
 def representative_alpha(curve: dict[float, list[float]], human: float) -> float | None:
@@ -169,26 +174,29 @@ def ablation_table(rows: list[dict]) -> str:
 
 
 def figure_2_4(rows: list[dict], human: float) -> Figure:
-    figure = Figure(figsize=(7, 4.4), layout="constrained")
-    axes = figure.subplots()
-    for mode, colour in (("sampled", "C0"), ("greedy", "C1")):
-        curve = alpha_curve(rows, mode)
-        means, halves = np.array([interval(scores) for scores in curve.values()]).T
-        axes.plot(list(curve), means, "o-", color=colour, markersize=4, label=f"student, {mode}")
-        axes.fill_between(
-            list(curve), means - np.nan_to_num(halves), means + np.nan_to_num(halves), color=colour, alpha=0.2
-        )
+    """Score over α, one panel for each way to act, one line for each temperature."""
+    figure = Figure(figsize=(12, 4.6), layout="constrained")
     teacher, _ = interval([row["mean"] for row in select(rows, "teacher", "greedy")])
-    axes.axhline(teacher, color="C3", linestyle="--", label="DQN")
-    axes.axhline(human, color="C2", linestyle="--", label="synthetic human")
     published = {0.0: PUBLISHED["BC, α = 0"][2], 0.93: PUBLISHED["hybrid, α = 0.93"][2]}
-    axes.plot(list(published), list(published.values()), "k*", markersize=9, label="published (Table 2.1)")
-    axes.set(
-        xlabel="α, weight of the DQN", ylabel="apples in 30 s, mean of 400 episodes", title="Fig. 2.4: score over α"
-    )
-    axes.set_ylim(bottom=0)
-    axes.legend(fontsize="small")
-    axes.spines[["top", "right"]].set_visible(False)
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, mode in zip(panels, ("sampled", "greedy")):
+        for i, temperature in enumerate(temperatures(rows)):
+            curve = alpha_curve(rows, mode, temperature)
+            means, halves = np.array([interval(scores) for scores in curve.values()]).T
+            width = 2.2 if temperature == 0.01 else 1.0
+            axes.plot(
+                list(curve), means, "o-", color=f"C{i}", markersize=3.5, linewidth=width, label=f"T = {temperature}"
+            )
+            low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
+            axes.fill_between(list(curve), low, high, color=f"C{i}", alpha=0.15, linewidth=0)
+        axes.axhline(teacher, color="black", linestyle="--", linewidth=1, label="DQN")
+        axes.axhline(human, color="black", linestyle=":", linewidth=1, label="synthetic human")
+        axes.plot(list(published), list(published.values()), "k*", markersize=9, label="published (Table 2.1)")
+        axes.set(xlabel="α, weight of the DQN", title=f"student, {mode}", ylim=(0, None))
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("apples in 30 s, mean of 400 episodes")
+    panels[1].legend(fontsize="small", loc="center left")
+    figure.suptitle("Fig. 2.4: score over α; bands are 95% intervals over seeds")
     return figure
 
 

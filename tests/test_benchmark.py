@@ -112,12 +112,20 @@ def test_the_rule_picks_the_smallest_alpha_that_beats_the_human():
     assert apple.representative_alpha(curve, 40.0) is None
 
 
-def test_only_the_main_sweep_is_in_the_curve():
+def test_a_curve_has_the_runs_of_its_temperature():
     rows = [
-        {"kind": kind, "alpha": 0.5, "mode": mode, "mean": mean}
-        for kind, mode, mean in [("alpha0.5", "sampled", 1), ("alpha0.5", "greedy", 2), ("T0_alpha0.5", "sampled", 3)]
+        {"kind": kind, "alpha": alpha, "temperature": temperature, "mode": mode, "mean": mean}
+        for kind, alpha, temperature, mode, mean in [
+            ("alpha0.0", 0.0, 0.01, "sampled", 1),
+            ("alpha0.5", 0.5, 0.01, "sampled", 2),
+            ("alpha0.5", 0.5, 0.01, "greedy", 3),
+            ("T1_alpha0.5", 0.5, 1.0, "sampled", 4),
+            ("own_alpha0.5", 0.5, 0.01, "sampled", 5),
+        ]
     ]
-    assert apple.alpha_curve(rows, "sampled") == {0.5: [1]}
+    assert apple.alpha_curve(rows, "sampled") == {0.0: [1], 0.5: [2]}
+    assert apple.alpha_curve(rows, "sampled", 1.0) == {0.0: [1], 0.5: [4]}
+    assert apple.temperatures(rows) == [0.01, 1.0]
 
 
 def test_interval_of_the_seeds_is_that_of_the_t_distribution():
