@@ -11,7 +11,9 @@ mkdir -p "$RUNS"
 for seed in $SEEDS; do
   echo "--seed $seed --run-dir $RUNS/teacher_seed$seed"
 done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/dqn_apple.py --compile --save-model --resume
-student() { echo "--seed $1 --teacher $RUNS/teacher_seed$1 --alpha $2 --run-dir $RUNS/$3_seed$1 ${*:4}"; }
+student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
+  echo --seed "$1" --teacher "$RUNS/teacher_seed$1" --alpha "$2" --run-dir "$RUNS/$3_seed$1" "${@:4}"
+}
 {
   for seed in $SEEDS; do
     for alpha in $ALPHAS; do student "$seed" "$alpha" "alpha$alpha"; done

@@ -70,7 +70,7 @@ def read_runs(folder: Path) -> list[dict]:
                     "temperature": args.get("temperature", ""),
                     "mode": mode,
                     **{name: round(numbers[name], 3) for name in ("mean", "std", "min", "max")},
-                    "test_accuracy_rl": round(result.get("test", {}).get("accuracy_rl", np.nan), 4),
+                    "test_accuracy_rl": round(result.get("test", {}).get("accuracy_rl") or np.nan, 4),
                     "test_accuracy_human": round(result.get("test", {}).get("accuracy_human", np.nan), 4),
                     "steps": result["global_step"],
                     "training_seconds": round(result["training_seconds"]),
@@ -108,7 +108,10 @@ def human_rows(method, seeds: list[int]) -> list[dict]:
 
 def table_2_1(rows: list[dict], human: list[dict]) -> str:
     """Table 2.1, published beside measured."""
-    lines = ["| agent | | seeds | max | min | avg | std |", "|---|---|---|---|---|---|---|"]
+    lines = [
+        "| agent | | seeds | max, mean over seeds | min, mean over seeds | avg | std |",
+        "|---|---|---|---|---|---|---|",
+    ]
     measured = {
         "human": [("synthetic human", human)],
         "DQN": [("measured", select(rows, "teacher", "greedy"))],
@@ -182,6 +185,8 @@ def figure_2_4(rows: list[dict], human: float) -> Figure:
     for axes, mode in zip(panels, ("sampled", "greedy")):
         for i, temperature in enumerate(temperatures(rows)):
             curve = alpha_curve(rows, mode, temperature)
+            if not curve:
+                continue
             means, halves = np.array([interval(scores) for scores in curve.values()]).T
             width = 2.2 if temperature == 0.01 else 1.0
             axes.plot(
@@ -301,7 +306,7 @@ def likeness_table(method, folder: Path, seeds: list[int], episodes: int) -> str
             measures[name]["reaction"].append(float(np.median(reaction_times(played))) / CLIP * 1000)
             measures[name]["changes"].append(changes_per_second(played))
     lines = [
-        "| agent | seeds | told from the human, AUC | reaction, ms (median) | changes of direction per s | score |",
+        "| agent | seeds | told from the human, AUC | reaction, ms (median) | changes of action per s | score |",
         "|---|---|---|---|---|---|",
     ]
     for name, values in measures.items():

@@ -18,7 +18,7 @@ def main(frames: int) -> None:
     torch.set_num_threads(1)
     env = Monitor(gym.make("cleanrl_thesis.dqn_apple:AppleGame-v0", disable_env_checker=True))
     settings = {"learning_rate": 5e-4, "buffer_size": 200_000, "batch_size": 32, "learning_starts": 1_000}
-    settings |= {"train_freq": 4, "gradient_steps": 1, "target_update_interval": 4_000, "seed": 1, "device": "cpu"}
+    settings |= {"train_freq": 4, "gradient_steps": 1, "target_update_interval": 500, "seed": 1, "device": "cpu"}
     model = DQN("MlpPolicy", env, exploration_final_eps=0.1, policy_kwargs={"net_arch": [64, 64]}, **settings)
     model.learn(2_000)  # warm-up
     start = time.perf_counter()

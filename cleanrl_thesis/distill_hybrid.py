@@ -203,7 +203,9 @@ def complete_args(args: Args) -> Args:
     require(
         not needs_teacher, "--alpha", args.alpha, "needs --teacher, the folder of a run of dqn_apple.py --save-model"
     )
-    known = args.demos is not None or args.env_id in SYNTHETIC_HUMANS
+    together = args.states == "human" or args.teacher is not None and args.split == "frame"
+    require(together, "--states", "own", "needs --teacher, and --split frame: the DQN's frames are of other episodes")
+    known = args.demos is not None or args.env_id.split(":")[-1] in SYNTHETIC_HUMANS
     require(known, "--env-id", args.env_id, f"needs --demos; only {', '.join(SYNTHETIC_HUMANS)} has a synthetic human")
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")
@@ -216,7 +218,7 @@ def complete_args(args: Args) -> Args:
 # The Apple game
 # ---------------------------------------------------------------------------------------------------------------------
 FPS, EPISODE_FRAMES = 60, 1_800  # an episode is 30 s
-SPEED = np.float32(0.00825)  # sides of the plane, per frame and axis; benchmark/apple_players.py shows why these three
+SPEED = np.float32(0.00825)  # sides of the plane, per frame and axis; made by benchmark/apple_players.py
 REACH = np.float32(0.06)  # distance at which an apple is taken, in sides of the plane
 LIFETIME = 90  # frames until an apple that nobody takes is gone
 MOVES = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.float32).T  # (2, 9); action 4 stays
@@ -292,8 +294,9 @@ class AppleGames:
         corner = np.array([0, 2 * bar]) + diameter / 2
         (a, b), (x, y) = (corner + point[:, game] * (fine - diameter) for point in (self.apples, self.avatars))
         pen.line((a, b - 0.4 * diameter, a + 0.2 * diameter, b - 0.8 * diameter), (110, 74, 40), fine // 100)
-        pen.circle((a, b), diameter / 2, (214, 48, 49))
-        pen.circle((x, y), diameter / 2, (45, 98, 198))
+        for middle_x, middle_y, colour in ((a, b, (214, 48, 49)), (x, y, (45, 98, 198))):
+            low, high = -diameter / 2, diameter / 2
+            pen.ellipse((middle_x + low, middle_y + low, middle_x + high, middle_y + high), colour)
         return np.asarray(image.reduce(2))
 
 
@@ -503,7 +506,7 @@ def read_episode(path: Path, checksum: str, env: gym.Env) -> dict[str, np.ndarra
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             observations, actions, rewards = arrays["observations"], arrays["actions"], arrays["rewards"]
-    except (KeyError, ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
+    except (KeyError, ValueError, TypeError, zipfile.BadZipFile, EOFError, OSError) as error:
         raise UsageError(f"--demos {path}: no demonstration: {first_line(error)}") from None
     shape = env.observation_space.shape
     fits = actions.ndim == 1 and observations.shape == (len(actions) + 1, *shape)
@@ -514,6 +517,8 @@ def read_episode(path: Path, checksum: str, env: gym.Env) -> dict[str, np.ndarra
     number = int(env.action_space.n)
     inside = np.issubdtype(actions.dtype, np.integer) and bool(((actions >= 0) & (actions < number)).all())
     require(inside, "--demos", path, f"actions must be whole numbers from 0 to {number - 1}")
+    scored = np.issubdtype(rewards.dtype, np.number) and rewards.shape == actions.shape and np.isfinite(rewards).all()
+    require(bool(scored), "--demos", path, "rewards must be finite numbers (T,)")
     return {"observations": observations, "actions": actions, "rewards": rewards}
 
 
@@ -521,7 +526,7 @@ def read_demonstrations(folder: Path, env_id: str) -> list[dict[str, np.ndarray]
     """All episodes of a folder, in the order of their names. Raises UsageError."""
     try:
         manifest = json.loads((folder / "manifest.json").read_text())
-        files, recorded = dict(manifest["files"]), manifest["env_id"]
+        files, recorded = dict(manifest["files"]), str(manifest["env_id"])
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"--demos {folder}: holds no demonstrations, it has no readable manifest.json") from None
     require(bool(files), "--demos", folder, "holds no demonstrations, its manifest names no file")
@@ -535,7 +540,8 @@ def make_human_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
     """Episodes of the synthetic human, enough for `--demo-frames`."""
     count = math.ceil(args.demo_frames / EPISODE_FRAMES)
     seeds = [episode_seed(args.seed, HUMAN_STREAM, i) for i in range(count)]
-    return play(SYNTHETIC_HUMANS[args.env_id](count, args.seed), args.env_id, seeds, keep=True)
+    human = SYNTHETIC_HUMANS[args.env_id.split(":")[-1]](count, args.seed)
+    return play(human, args.env_id, seeds, keep=True)
 
 
 class QNetwork(nn.Module):
@@ -586,17 +592,19 @@ def load_teacher(folder: Path, env_id: str) -> QNetwork:
     try:
         with safetensors.safe_open(path, "pt") as file:
             args = json.loads(file.metadata()["args"])
-        trained_on = args["env_id"]
+        trained_on = str(args["env_id"])
     except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"--teacher {path}: is no model of dqn_apple.py: {first_line(error)}") from None
     same_game = trained_on.split(":")[-1] == env_id.split(":")[-1]
     require(same_game, "--teacher", folder, f"was trained on {trained_on}, --env-id is {env_id}")
+    skip = args.get("frame_skip")
+    require(skip == 1, "--teacher", folder, f"acts once in {skip} frames, the student acts in each")
     env = make_env(env_id)
     try:
         shape = env.observation_space.shape[0], int(env.action_space.n), args["hidden_size"]
         teacher = QNetwork(*shape, args["dueling"])
         teacher.load_state_dict(safetensors.torch.load_file(path))
-    except (safetensors.SafetensorError, KeyError, RuntimeError) as error:
+    except (safetensors.SafetensorError, KeyError, TypeError, RuntimeError) as error:
         raise UsageError(f"--teacher {path}: its network has another shape: {first_line(error)}") from None
     return teacher
 
@@ -755,6 +763,7 @@ def measure(student: Student, data: Data, args: Args) -> dict[str, float]:
     agrees_rl = (rl_logits.argmax(1) == data.rl_labels.argmax(1)).float().mean().item()
     agrees_he = (he_logits.argmax(1) == data.he_actions).float().mean().item()
     accuracy = args.alpha * agrees_rl + (1 - args.alpha) * agrees_he
+    agrees_rl = agrees_rl if args.teacher is not None else math.nan
     return {
         "test/loss": loss.item(),
         "test/accuracy": accuracy,
@@ -934,7 +943,7 @@ MAX_EVALUATION_STEPS = 100_000  # of an episode, where the environment has no ti
 
 def make_games(env_id: str, num_envs: int) -> gym.vector.VectorEnv:
     """Environments side by side: the Apple game's own vectorised one, else copies stepped in turn."""
-    if gym.spec(env_id).vector_entry_point is AppleGameVectorEnv:
+    if env_id.split(":")[-1] == "AppleGame-v0":
         return AppleGameVectorEnv(num_envs)
     same_step = gym.vector.AutoresetMode.SAME_STEP
     return gym.vector.SyncVectorEnv([lambda: make_env(env_id)] * num_envs, autoreset_mode=same_step)
@@ -958,11 +967,9 @@ def play(policy, env_id: str, seeds: list[int], frame_skip: int = 1, keep: bool 
         time_outs = time_outs | (len(rewards) + 1 == MAX_EVALUATION_STEPS)
         rewards.append(reward)
         if keep:
-            after, ended = obs, np.flatnonzero(ends | time_outs)
-            if len(ended) and "final_obs" in infos:
-                after = obs.copy()
-                for i in ended:
-                    after[i] = infos["final_obs"][i]
+            after = obs.copy()
+            for i in np.flatnonzero(infos.get("_final_obs", [])):
+                after[i] = infos["final_obs"][i]
             observations.append(after)
             actions.append(action)
         lengths += running
@@ -1144,11 +1151,11 @@ def label_frames(human: Frames, teacher: QNetwork | None, args: Args) -> Data:
         return Data(rl_obs, soft_labels(teacher(rl_obs), args.temperature), he_obs, he_actions)
 
 
-def fingerprint(data: Data) -> str:
-    """SHA-256 of all that is learned from: demonstrations, and the teacher's labels."""
-    digest = hashlib.sha256()
-    for column in data:
-        digest.update(column.numpy().tobytes())
+def fingerprint(human: Frames, teacher: QNetwork | None) -> str:
+    """SHA-256 of all that is learned from."""
+    digest = hashlib.sha256(human.obs.tobytes() + human.actions.tobytes())
+    for tensor in () if teacher is None else teacher.state_dict().values():
+        digest.update(tensor.numpy().tobytes())
     return digest.hexdigest()
 
 
@@ -1176,15 +1183,18 @@ def main(args: Args) -> int:
     torch.set_num_threads(args.num_threads)
     human = join_frames(human_episodes, args.demo_frames)
     data = label_frames(human, teacher, args)
+    split_rng = np.random.default_rng(np.random.SeedSequence([args.seed, 0]))
+    is_test = torch.from_numpy(split_frames(human.episodes, args.test_frames, args.split, split_rng))
+    require(not is_test.all(), "--split", args.split, f"leaves no episode to train on, with {args.test_frames} to test")
     run_dir, checkpoint = open_run_dir(args)
     last_epoch = min(args.epochs, args.stop_at)
+    same_data = checkpoint is None or checkpoint["data"] == fingerprint(human, teacher)
+    require(same_data, "--resume", run_dir, "demonstrations or teacher are no longer those that the run began with")
     if is_done(run_dir, args, last_epoch):
         print(f"{run_dir} is done")
         return 0
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
-    same_data = checkpoint is None or checkpoint["data"] == fingerprint(data)
-    require(same_data, "--resume", run_dir, "demonstrations or teacher are no longer those that the run began with")
     write_json(run_dir / "args.json", arguments(args))
     (run_dir / "result.json").unlink(missing_ok=True)
     print(run_dir)
@@ -1201,8 +1211,6 @@ def main(args: Args) -> int:
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     stop = StopSignal()
 
-    split_rng = np.random.default_rng(np.random.SeedSequence([args.seed, 0]))
-    is_test = torch.from_numpy(split_frames(human.episodes, args.test_frames, args.split, split_rng))
     training, test = (Data(*(column[rows].to(device) for column in data)) for rows in (~is_test, is_test))
     student = Student(data.he_obs.shape[1], data.rl_labels.shape[1], args.hidden_size).to(device)
     update = Update(student, args, training.at(torch.arange(min(args.batch_size, len(training.he_obs)))))
@@ -1242,7 +1250,7 @@ def main(args: Args) -> int:
             state = {
                 "args": arguments(args),
                 "arithmetic": arithmetic,
-                "data": fingerprint(data),
+                "data": fingerprint(human, teacher),
                 "epoch": epoch,
                 "training_seconds": training_seconds,
                 "offset": updates_csv.sync(),
@@ -1290,7 +1298,11 @@ def finish_run(
         "complete": epoch == args.epochs,
         "finish": {name: arguments(args)[name] for name in FINISH},
         "human": human,
-        "test": {"epoch": best["epoch"], "accuracy_rl": best["rl"], "accuracy_human": best["human"]},
+        "test": {
+            "epoch": best["epoch"],
+            "accuracy_rl": None if args.teacher is None else best["rl"],
+            "accuracy_human": best["human"],
+        },
         "evaluation": {
             mode: {name: value for name, value in evaluation[mode].items() if name != "returns"} for mode in modes
         },

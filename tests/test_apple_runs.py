@@ -159,8 +159,30 @@ def test_demonstrations_can_be_played_again_and_read(kind, request):
 def test_a_dqn_of_another_environment(tmp_path):
     flags = ["--env-id", "CartPole-v1", "--total-timesteps", 3000, "--eval-episodes", 2, "--capture-video"]
     run(*flags, "--run-dir", "run", cwd=tmp_path, script=DQN)
-    assert list((tmp_path / "run" / "videos").glob("*.mp4"))
+    assert len(list((tmp_path / "run" / "videos").glob("*.mp4"))) == 1
     assert json.loads((tmp_path / "run" / "result.json").read_text())["complete"]
+
+
+def test_the_game_by_its_full_name(tmp_path):
+    name = ["--env-id", "cleanrl_thesis.dqn_apple:AppleGame-v0", "--run-dir", "run"]
+    run(*SMALL_DQN[:-4], *name, "--total-timesteps", 2000, "--eval-episodes", 2, cwd=tmp_path, script=DQN)
+    flags = [*SMALL_DISTILL, "--alpha", 0, "--epochs", 1, *name[:2], "--run-dir", "student"]
+    run(*flags, cwd=tmp_path, script=DISTILL)
+
+
+@pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"short")])
+def test_a_lost_replay_buffer_is_not_taken_for_an_empty_one(damage, teacher, tmp_path):
+    shutil.copytree(teacher, tmp_path / "run")
+    (tmp_path / "run" / "result.json").unlink()
+    damage(tmp_path / "run" / "replay.dat")
+    done = run(*SMALL_DQN, "--run-dir", "run", "--resume", cwd=tmp_path, script=DQN, code=1)
+    assert "replay.dat" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_stop_at_and_going_on_is_one_run(teacher, tmp_path):
+    run(*SMALL_DQN, "--stop-at", 7_321, "--run-dir", "run", cwd=tmp_path, script=DQN)
+    run(*SMALL_DQN, "--run-dir", "run", "--resume", cwd=tmp_path, script=DQN)
+    assert_same_run(teacher, tmp_path / "run", DQN_RECORDS)
 
 
 @pytest.mark.parametrize("flags", [["--states", "own", "--alpha", 0.5], ["--split", "episode", "--temperature", 0]])
@@ -208,6 +230,8 @@ BAD_DISTILL = [
     (["--alpha", 0, "--test-frames", 16_000], ["--test-frames", "16000"]),
     (["--alpha", 0, "--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "--demos"]),
     (["--alpha", 0, "--states", "mine"], ["--states", "mine"]),
+    (["--alpha", 0, "--states", "own"], ["--states", "own", "--teacher"]),
+    (["--alpha", 0, "--split", "episode", "--demo-frames", 1800], ["--split", "episode", "no episode to train on"]),
     (["--teacher", "no/such/folder"], ["--teacher", "no/such/folder", "model.safetensors"]),
     (["--alpha", 0, "--demos", "no/such/folder"], ["--demos", "no/such/folder", "manifest"]),
 ]
@@ -283,6 +307,7 @@ def empty(folder: Path) -> None:
         (lambda f: rewrite(f, lambda a: {**a, "actions": a["actions"] + 5}), ["actions", "from 0 to 8"]),
         (lambda f: rewrite(f, lambda a: {**a, "actions": a["actions"] * 0.5}), ["actions", "whole numbers"]),
         (lambda f: rewrite(f, lambda a: {k: v for k, v in a.items() if k != "actions"}), ["no demonstration"]),
+        (lambda f: rewrite(f, lambda a: {**a, "rewards": a["rewards"] * np.nan}), ["rewards", "finite"]),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -304,8 +329,15 @@ def test_a_teacher_of_another_game_is_named(teacher, tmp_path, monkeypatch, caps
     monkeypatch.chdir(tmp_path)
     tensors = safetensors.torch.load_file(teacher / "model.safetensors")
     for metadata, words in (
-        ({"args": json.dumps({"env_id": "ALE/Gopher-v5", "dueling": True})}, ["ALE/Gopher-v5", "AppleGame-v0"]),
-        ({"args": json.dumps({"env_id": "AppleGame-v0", "dueling": False, "hidden_size": 64})}, ["another shape"]),
+        (
+            {"args": json.dumps({"env_id": "ALE/Gopher-v5", "dueling": True, "frame_skip": 4})},
+            ["ALE/Gopher-v5", "AppleGame-v0"],
+        ),
+        (
+            {"args": json.dumps({"env_id": "AppleGame-v0", "dueling": False, "hidden_size": 64, "frame_skip": 1})},
+            ["another shape"],
+        ),
+        ({"args": json.dumps({"env_id": "AppleGame-v0", "frame_skip": 4})}, ["once in 4 frames"]),
         ({}, ["no model of dqn_apple.py"]),
     ):
         safetensors.torch.save_file(tensors, "model.safetensors", metadata)

@@ -1,0 +1,177 @@
+"""The hybrid loss, its labels and its update, and the synthetic human, against independent sources."""
+
+import math
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT
+
+from cleanrl_thesis import distill_hybrid as distill
+
+
+@pytest.mark.parametrize("temperature", [0, 0.01, 0.5, 2])
+def test_soft_labels_against_the_definition(temperature):
+    q_values = torch.randn(20, 9, generator=torch.Generator().manual_seed(0))
+    labels = distill.soft_labels(q_values, temperature)
+    for row, label in zip(q_values.tolist(), labels):
+        if temperature == 0:
+            expected = [float(q == max(row)) for q in row]
+        else:
+            weights = [math.exp((q - max(row)) / temperature) for q in row]
+            expected = [weight / sum(weights) for weight in weights]
+        assert np.allclose(label, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
+def test_hybrid_loss_against_the_equation(alpha):
+    """L_mix of section 2.3.2, summed by hand."""
+    generator = torch.Generator().manual_seed(0)
+    rl_logits, he_logits = torch.randn(2, 16, 9, generator=generator)
+    labels = torch.softmax(torch.randn(16, 9, generator=generator), 1)
+    actions = torch.randint(9, (16,), generator=generator)
+    loss, (rl_loss, he_loss) = distill.hybrid_loss(rl_logits, labels, he_logits, actions, alpha)
+    rl = he = 0.0
+    for i in range(16):
+        policies = [torch.softmax(logits[i].double(), 0) for logits in (rl_logits, he_logits)]
+        rl -= sum(labels[i, a].item() * math.log(policies[0][a]) for a in range(9)) / 16
+        he -= math.log(policies[1][actions[i]]) / 16
+    assert math.isclose(rl_loss.item(), rl, rel_tol=1e-5) and math.isclose(he_loss.item(), he, rel_tol=1e-5)
+    assert math.isclose(loss.item(), alpha * rl + (1 - alpha) * he, rel_tol=1e-5)
+
+
+def test_the_loss_is_least_where_the_policy_is_the_mixture():
+    """In one state, the best policy is α π_RL + (1 − α) π_HE."""
+    alpha, labels = 0.7, torch.tensor([[0.1, 0.6, 0.3]])
+    logits = torch.zeros(1, 3, requires_grad=True)
+    optimizer = torch.optim.Adam([logits], 0.05)
+    for _ in range(2000):
+        loss, _ = distill.hybrid_loss(logits, labels, logits, torch.tensor([2]), alpha)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert torch.allclose(torch.softmax(logits, 1), torch.tensor([[0.07, 0.42, 0.51]]), atol=1e-3)
+
+
+def test_split_by_frame_is_random_and_of_the_right_size():
+    is_test = distill.split_frames(np.repeat(np.arange(10), 100), 150, "frame", np.random.default_rng(0))
+    assert is_test.sum() == 150
+    assert all(is_test[i : i + 100].any() for i in range(0, 1000, 100))
+
+
+def test_split_by_episode_keeps_episodes_whole():
+    episodes = np.repeat(np.arange(10), 100)
+    is_test = distill.split_frames(episodes, 150, "episode", np.random.default_rng(0))
+    assert is_test.sum() == 200
+    assert all(is_test[i : i + 100].all() or not is_test[i : i + 100].any() for i in range(0, 1000, 100))
+
+
+def test_dropout_masks_keep_the_mean():
+    masks = distill.draw_masks((2, 1000, 100), 0.3)
+    assert masks.unique().tolist() == pytest.approx([0.0, 1 / 0.7])
+    assert abs(masks.mean().item() - 1) < 0.01
+
+
+def make_update(**settings):
+    args = distill.complete_args(distill.Args(teacher=".", hidden_size=32, **settings))
+    torch.manual_seed(0)
+    student = distill.Student(6, 9, 32)
+    generator = torch.Generator().manual_seed(1)
+    rl_obs, he_obs = torch.rand(2, 64, 6, generator=generator)
+    labels = torch.softmax(torch.randn(64, 9, generator=generator), 1)
+    data = distill.Data(rl_obs, labels, he_obs, torch.randint(9, (64,), generator=generator))
+    if args.states == "human":
+        data = data._replace(rl_obs=data.he_obs)
+    return student, distill.Update(student, args, data), data, args
+
+
+@pytest.mark.parametrize("states", ["human", "own"])
+def test_update_is_torchs_adam_on_the_loss(states):
+    student, update, data, args = make_update(states=states)
+    layers = [torch.nn.Linear(6, 32), torch.nn.Linear(32, 32), torch.nn.Linear(32, 9)]
+    for layer, source in zip(layers, student.layers):
+        layer.load_state_dict(source.state_dict())
+    adam = torch.optim.Adam([parameter for layer in layers for parameter in layer.parameters()], 1e-4)
+
+    def peer(obs: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
+        hidden = torch.relu(layers[1](torch.relu(layers[0](obs)) * masks[0])) * masks[1]
+        return torch.log_softmax(layers[2](hidden), 1)
+
+    for _ in range(5):
+        masks = distill.draw_masks((2, 64, 32), 0.5)
+        update(data, masks)
+        rl = -(data.rl_labels * peer(data.rl_obs, masks)).sum(1).mean()
+        he = -peer(data.he_obs, masks)[torch.arange(64), data.he_actions].mean()
+        adam.zero_grad()
+        (args.alpha * rl + (1 - args.alpha) * he).backward()
+        adam.step()
+    for layer, source in zip(layers, student.layers):
+        assert torch.allclose(layer.weight, source.weight, atol=2e-6)
+
+
+def test_compiled_update_is_the_plain_one():
+    (_, plain, data, _), (_, compiled, _, _) = make_update(), make_update(compile=True)
+    assert compiled.step is not compiled.plain_step
+    for _ in range(20):
+        masks = distill.draw_masks((2, 64, 32), 0.5)
+        parts = [torch.stack(update(data, masks)) for update in (plain, compiled)]
+        assert torch.allclose(parts[0], parts[1], atol=1e-5)
+    assert torch.allclose(plain.vector, compiled.vector, atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["sampled", "greedy"])
+def test_numpy_policy_is_the_students(mode):
+    student = distill.Student(6, 9, 32)
+    obs = torch.rand(1, 6).repeat(20_000, 1)
+    actions = distill.numpy_policy(student, mode, 0)(obs.numpy())
+    with torch.no_grad():
+        probabilities = torch.softmax(student(obs[:1]), 1)[0]
+    if mode == "greedy":
+        assert set(actions) == {int(probabilities.argmax())}
+    else:
+        assert np.allclose(np.bincount(actions, minlength=9) / 20_000, probabilities, atol=0.015)
+
+
+# The synthetic human
+def test_the_synthetic_human_scores_as_the_published_one():
+    """Table 2.1: 18.71 ± 2.86 with from 11 to 27."""
+    human = distill.SyntheticHuman(400, seed=3)
+    scores = [episode["rewards"].sum() for episode in distill.play(human, "AppleGame-v0", list(range(400)))]
+    assert abs(np.mean(scores) - 18.71) < 0.7
+    assert 2.5 < np.std(scores) < 3.9
+
+
+def test_the_synthetic_human_needs_time_to_react_and_holds_its_keys():
+    human = distill.SyntheticHuman(50, seed=3)
+    episodes = distill.play(human, "AppleGame-v0", list(range(50)), keep=True)
+    first_moves = [np.flatnonzero(episode["actions"] != 4)[0] for episode in episodes]
+    assert min(first_moves) > 6 and 13 < np.median(first_moves) < 22  # frames: 0.1 s and 0.2 to 0.4 s
+    changes = [np.mean(episode["actions"][1:] != episode["actions"][:-1]) for episode in episodes]
+    assert np.mean(changes) * 60 < 8  # key changes per second
+
+
+def test_the_synthetic_human_is_the_same_for_the_same_seed():
+    runs = [distill.play(distill.SyntheticHuman(2, seed), "AppleGame-v0", [1, 2], keep=True) for seed in (5, 5, 6)]
+    same, other = (all(np.array_equal(a["actions"], b["actions"]) for a, b in zip(runs[0], run)) for run in runs[1:])
+    assert same and not other
+
+
+def test_every_line_of_the_sweep_is_one_run(tmp_path):
+    """xargs joins a line that ends in a blank to the next one."""
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\necho "$@" >> ' + str(tmp_path / "calls") + "\n")
+    python.chmod(0o755)
+    env = {
+        "PATH": "/usr/bin:/bin",
+        "PYTHON": str(python),
+        "SEEDS": "1 2",
+        "RUNS": str(tmp_path / "runs"),
+        "WORKERS": "1",
+    }
+    subprocess.run([ROOT / "benchmark" / "apple_alpha.sh"], env=env, check=True, capture_output=True)
+    calls = (tmp_path / "calls").read_text().splitlines()
+    assert sum("dqn_apple.py" in call for call in calls) == 2
+    students = [call for call in calls if "distill_hybrid.py" in call]
+    assert len(students) == len(set(students)) == 2 * (12 + 5 * 6 + 3 + 2)
+    assert all(call.count("--seed") == call.count("--run-dir") == 1 for call in students)
