@@ -1133,7 +1133,8 @@ class Means:
         count = max(1, self.count)
         means = {"losses/td_error": self.td_error / count, "losses/q_values": self.q_value / count}
         metrics = {"charts/updates": self.count, **means}
-        self.__init__()
+        self.td_error = self.q_value = 0.0
+        self.count = 0
         return metrics
 
 
@@ -1207,6 +1208,7 @@ def main(args: Args) -> int:
     while iteration < last_iteration:
         iteration += 1
         epsilon = linear_schedule(args.start_e, args.end_e, exploration_frames, global_step)
+        remaining = 1.0 - global_step / args.total_timesteps if args.anneal_lr else 1.0
         for i, player in enumerate(players):
             explores = rng.random() < epsilon
             action = int(rng.integers(num_actions)) if explores else int(greedy(player.obs[None])[0])
@@ -1221,7 +1223,7 @@ def main(args: Args) -> int:
 
         if buffer.added >= args.batch_size and global_step >= args.learning_starts:
             for _ in range(global_step // args.train_frequency - before // args.train_frequency):
-                optimizer.anneal(1.0 - before / args.total_timesteps if args.anneal_lr else 1.0)
+                optimizer.anneal(remaining)
                 means.add(update(buffer.sample(args.batch_size, rng).to(device)))
                 greedy = numpy_greedy(agent) if device.type == "cuda" else greedy
         if global_step // args.target_network_frequency > before // args.target_network_frequency:
@@ -1237,8 +1239,8 @@ def main(args: Args) -> int:
         if not optimizer.vector.isfinite().all():
             raise RunError(f"frame {global_step}: the network's parameters are no longer finite")
         if logs:
-            rate = optimizer.rate.item()
-            metrics = {"charts/epsilon": epsilon, "charts/learning_rate": rate, **means.take()}
+            schedules = {"charts/epsilon": epsilon, "charts/learning_rate": remaining * args.learning_rate}
+            metrics = {**schedules, **means.take()}
             updates_csv.write({"global_step": global_step, **metrics})
             add_scalars(writer, {**metrics, "charts/SPS": global_step / training_seconds}, global_step)
         if crossed or stop.received or iteration == last_iteration:
