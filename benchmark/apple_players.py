@@ -72,12 +72,13 @@ def measure(method, player: str, args: Args) -> dict:
 
 
 def neighbours(method, args: Args):
-    """Rows at other constants: for each lifetime the speed at which the shortest path scores as published."""
-    speed, lifetime, reaction = method.SPEED, method.LIFETIME, method.SyntheticHuman.reaction
-    for frames in (45, 60, 75, 90, 120):
+    """Rows at other constants: for each reach and lifetime the speed at which the shortest path scores as published."""
+    constants = method.SPEED, method.REACH, method.LIFETIME, method.SyntheticHuman.reaction
+    for reach, lifetime in ((0.06, 45), (0.06, 60), (0.06, 75), (0.06, 90), (0.06, 120), (0.05, 90), (0.07, 90)):
         slow, fast = 0.006, 0.012
+        method.REACH, method.LIFETIME = np.float32(reach), lifetime
         for _ in range(10):
-            method.LIFETIME, method.SPEED = frames, np.float32(round((slow + fast) / 2, 5))
+            method.SPEED = np.float32(round((slow + fast) / 2, 5))
             if measure(method, "shortest path", args)["mean"] < PUBLISHED["shortest path"][0]:
                 slow = (slow + fast) / 2
             else:
@@ -85,7 +86,7 @@ def neighbours(method, args: Args):
         yield measure(method, "shortest path", args)
         for method.SyntheticHuman.reaction in (12.0, 15.0, 18.0, 21.0):
             yield measure(method, "synthetic human", args)
-    method.SPEED, method.LIFETIME, method.SyntheticHuman.reaction = speed, lifetime, reaction
+    method.SPEED, method.REACH, method.LIFETIME, method.SyntheticHuman.reaction = constants
 
 
 def table(rows: list[dict]) -> str:

@@ -200,7 +200,7 @@ def figure_2_4(rows: list[dict], human: float) -> Figure:
         axes.set(xlabel="α, weight of the DQN", title=f"student, {mode}", ylim=(0, None))
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("apples in 30 s, mean of 400 episodes")
-    panels[1].legend(fontsize="small", loc="center left")
+    figure.legend(*panels[1].get_legend_handles_labels(), fontsize="small", loc="outside right center")
     figure.suptitle("Fig. 2.4: score over α; bands are 95% intervals over seeds")
     return figure
 
