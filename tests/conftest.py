@@ -1,6 +1,8 @@
 """What the tests share: small runs through the command line."""
 
 import os
+import random
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +32,23 @@ def run(
     done = subprocess.run(command(*flags, script=script), cwd=cwd, env=env, capture_output=True, text=True, timeout=600)
     assert done.returncode == code, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
     return done
+
+
+def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:
+    """Start a run that takes about `seconds`, kill it, resume it, and kill it again, both at random moments."""
+    rng, folder, kills, longest = random.Random(seed), Path(flags[flags.index("--run-dir") + 1]), 0, 0.8 * seconds
+    while kills < 2:
+        line = command(*flags, "--resume", script=script)
+        process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            process.wait(timeout=rng.uniform(0.5, longest))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            kills += 1
+        else:  # it came to its end first
+            shutil.rmtree(folder)
+            kills, longest = 0, 0.7 * longest
 
 
 def assert_same_run(left: Path, right: Path) -> None:
