@@ -166,6 +166,7 @@ def test_the_game_by_its_full_name(tmp_path):
     run(*SMALL_DQN[:-4], *name, "--total-timesteps", 2000, "--eval-episodes", 2, cwd=tmp_path, script=DQN)
     flags = [*SMALL_DISTILL, "--alpha", 0, "--epochs", 1, *name[:2], "--run-dir", "student"]
     run(*flags, cwd=tmp_path, script=DISTILL)
+    assert all((tmp_path / name / "result.json").exists() for name in ("run", "student"))
 
 
 @pytest.mark.parametrize("damage", [lambda path: path.unlink(), lambda path: path.write_bytes(b"short")])
