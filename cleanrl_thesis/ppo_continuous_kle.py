@@ -577,7 +577,7 @@ def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
     for name, space in (("observations", env.observation_space), ("actions", env.action_space)):
         require(isinstance(space, gym.spaces.Box), "--env-id", env_id, f"needs Box {name}, this one has {space}")
     model = getattr(env.unwrapped, "model", None)
-    if isinstance(model, mujoco.MjModel) and model.ntree == 1:  # it is one island: looking for more takes 3 to 7%
+    if isinstance(model, mujoco.MjModel) and model.ntree == 1:  # it is one island: looking for more takes up to 7%
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     return env
 
