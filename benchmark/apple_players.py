@@ -9,6 +9,7 @@ with at most 53, and a person's near 18.71 ± 2.86. Writes `benchmark/results/ap
 
 import csv
 import importlib.util
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,7 +112,9 @@ def main(args: Args) -> None:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    (args.out / "players.md").write_text(table(rows))
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+    line = f"python benchmark/apple_players.py{' --calibrate' if args.calibrate else ''} --seed {args.seed}"
+    (args.out / "players.md").write_text(f"`{line}`, commit {commit[:7]}\n\n{table(rows)}")
     print(table(rows))
 
 

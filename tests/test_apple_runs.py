@@ -93,7 +93,7 @@ def test_a_killed_dqn_ends_with_the_same_bytes(extra, teacher, tmp_path):
 
 
 def test_a_dqn_with_a_torn_checkpoint_finds_its_replay_buffer(teacher, tmp_path):
-    """The checkpoint before the newest is two intervals behind what was written into the ring."""
+    """The checkpoint before the newest is an interval behind what was written into the ring."""
     shutil.copytree(teacher, tmp_path / "run")
     path = tmp_path / "run" / "checkpoint.pt"
     path.write_bytes(path.read_bytes()[:1000])
