@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# The Apple game: a teacher for each seed, students over α, and the ablations; the runs behind benchmark/results/apple/.
+# The Apple game: a teacher for each seed, students over α and T, other states and splits, and students of a human who is
+# nearer to the DQN ("quick"); the runs behind benchmark/results/apple/.
 # Can be sent again after every stop. Two runs at a time: about 3 hours on 2 cores.
 #   benchmark/apple_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/apple_alpha.sh
@@ -8,9 +9,14 @@ cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
 ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
 mkdir -p "$RUNS"
+git rev-parse --short HEAD >> "$RUNS/commits.txt"
 for seed in $SEEDS; do
   echo "--seed $seed --run-dir $RUNS/teacher_seed$seed"
 done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/dqn_apple.py --compile --save-model --resume
+for seed in $SEEDS; do
+  demos="$RUNS/quick_demos_seed$seed"
+  [ -e "$demos/manifest.json" ] || "$PYTHON" benchmark/apple_players.py --seed "$seed" --demos "$demos"
+done
 student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
   echo --seed "$1" --teacher "$RUNS/teacher_seed$1" --alpha "$2" --run-dir "$RUNS/$3_seed$1" "${@:4}"
 }
@@ -20,12 +26,19 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
   done
   for seed in $SEEDS; do
     for temperature in 0 0.1 0.5 1 2; do
-      for alpha in 0.93 1.0 0.5 0.7 0.8 0.3; do
+      for alpha in 0.93 1.0 0.5 0.7 0.8 0.3 0.9; do
         student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"
       done
     done
     for alpha in 0.5 0.93 1.0; do student "$seed" "$alpha" "own_alpha$alpha" --states own; done
     for alpha in 0.0 0.93; do student "$seed" "$alpha" "episode_alpha$alpha" --split episode; done
+    quick=(--demos "$RUNS/quick_demos_seed$seed")
+    student "$seed" 0.0 quick_alpha0.0 "${quick[@]}"
+    for temperature in 0.01 0.5; do
+      for alpha in 0.3 0.5 0.7 0.8 0.93 1.0; do
+        student "$seed" "$alpha" "quick_T${temperature}_alpha$alpha" --temperature "$temperature" "${quick[@]}"
+      done
+    done
   done
 } | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --compile --save-model --resume
 "$PYTHON" benchmark/apple_report.py --runs "$RUNS"

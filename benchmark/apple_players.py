@@ -1,7 +1,8 @@
 """How the constants of the Apple game and of its synthetic human were chosen: scores of scripted players.
 
-    python benchmark/apple_players.py                  # both players at the chosen constants, beside Table 2.1
-    python benchmark/apple_players.py --calibrate      # neighbouring constants too, about two minutes
+    python benchmark/apple_players.py                       # both players at the chosen constants, beside Table 2.1
+    python benchmark/apple_players.py --calibrate           # neighbouring constants too, about two minutes
+    python benchmark/apple_players.py --demos DIR --seed 1  # demonstrations of a human who is nearer to the DQN
 
 The game is fixed by two published rows that have to fit at once: the shortest-path player near the DQN's, 36.27 ± 5.44
 with at most 53, and a person's near 18.71 ± 2.86. Writes `benchmark/results/apple/players.csv` and `.md`.
@@ -18,7 +19,9 @@ import numpy as np
 import tyro
 
 ROOT = Path(__file__).resolve().parent.parent
-PUBLISHED = {"shortest path": (36.27, 5.44, 15, 53), "synthetic human": (18.71, 2.86, 11, 27)}  # Table 2.1: DQN, human
+PLAYERS = {"shortest path": "DQN", "synthetic human": "human"}  # and the row of Table 2.1 that each is to be like
+
+QUICK = {"reaction": 4.0, "lapse": 0.0, "lag": 1.0, "pause": 3.0, "slip": 0.0}  # what the quick human has otherwise
 
 
 @dataclass
@@ -29,6 +32,8 @@ class Args:
     """seed of the games and of the synthetic human"""
     calibrate: bool = False
     """also play with neighbouring constants"""
+    demos: Path | None = None
+    """only write demonstrations of a quick human into this folder, as many as a student takes by default"""
     out: Path = ROOT / "benchmark" / "results" / "apple"
     """folder for the results"""
 
@@ -39,6 +44,17 @@ def load_method(name: str):
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def published_table() -> dict[str, dict[str, str]]:
+    """The rows of Table 2.1 by agent."""
+    with open(ROOT / "benchmark" / "published" / "table_2_1.csv", newline="") as file:
+        return {row["agent"]: row for row in csv.DictReader(file)}
+
+
+def commit() -> str:
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.strip()
 
 
 def shortest_path(method):
@@ -72,15 +88,27 @@ def measure(method, player: str, args: Args) -> dict:
     }
 
 
+def write_quick_demonstrations(method, args: Args) -> None:
+    """Demonstrations of the synthetic human without lapses and with reactions and pauses of a few frames."""
+    human = type("QuickHuman", (method.SyntheticHuman,), QUICK)
+    count = method.Args.demo_frames // method.EPISODE_FRAMES + 1
+    seeds = [method.episode_seed(args.seed, method.HUMAN_STREAM, i) for i in range(count)]
+    episodes = method.play(human(count, args.seed), "AppleGame-v0", seeds, keep=True)
+    args.demos.mkdir(parents=True, exist_ok=True)
+    about = {"env_id": "AppleGame-v0", "player": "synthetic human, quick", "mode": "scripted"}
+    method.write_demonstrations(args.demos, episodes, about)
+
+
 def neighbours(method, args: Args):
     """Rows at other constants: for each reach and lifetime the speed at which the shortest path scores as published."""
+    target = float(published_table()["DQN"]["avg"])
     constants = method.SPEED, method.REACH, method.LIFETIME, method.SyntheticHuman.reaction
     for reach, lifetime in ((0.06, 45), (0.06, 60), (0.06, 75), (0.06, 90), (0.06, 120), (0.05, 90), (0.07, 90)):
         slow, fast = 0.006, 0.012
         method.REACH, method.LIFETIME = np.float32(reach), lifetime
         for _ in range(10):
             method.SPEED = np.float32(round((slow + fast) / 2, 5))
-            if measure(method, "shortest path", args)["mean"] < PUBLISHED["shortest path"][0]:
+            if measure(method, "shortest path", args)["mean"] < target:
                 slow = (slow + fast) / 2
             else:
                 fast = (slow + fast) / 2
@@ -94,9 +122,9 @@ def table(rows: list[dict]) -> str:
     """The rows as Markdown, the published ones first."""
     names = list(rows[0])
     lines = [f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
-    for player, numbers in PUBLISHED.items():
-        published = "Table 2.1: " + {"shortest path": "DQN"}.get(player, "human")
-        cells = [published, "", "", "", "", 400, *numbers[:2], *numbers[2:]]
+    for agent in PLAYERS.values():
+        row = published_table()[agent]
+        cells = [f"Table 2.1: {agent}", "", "", "", "", 400, *(row[name] for name in ("avg", "std", "min", "max"))]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     lines += [f"| {' | '.join(str(row[name]) for name in names)} |" for row in rows]
     return "\n".join(lines) + "\n"
@@ -104,7 +132,9 @@ def table(rows: list[dict]) -> str:
 
 def main(args: Args) -> None:
     method = load_method("distill_hybrid")
-    rows = [measure(method, player, args) for player in PUBLISHED]
+    if args.demos is not None:
+        return write_quick_demonstrations(method, args)
+    rows = [measure(method, player, args) for player in PLAYERS]
     if args.calibrate:
         rows += neighbours(method, args)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -112,9 +142,8 @@ def main(args: Args) -> None:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
     line = f"python benchmark/apple_players.py{' --calibrate' if args.calibrate else ''} --seed {args.seed}"
-    (args.out / "players.md").write_text(f"`{line}`, commit {commit[:7]}\n\n{table(rows)}")
+    (args.out / "players.md").write_text(f"`{line}`, commit {commit()}\n\n{table(rows)}")
     print(table(rows))
 
 

@@ -7,10 +7,9 @@ the seeds' means; each mean is over 400 episodes.
 """
 
 import csv
-import importlib.util
+import itertools
 import json
 import re
-import sys
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,17 +21,11 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
+from apple_players import QUICK, ROOT, commit, load_method, published_table, shortest_path
 from matplotlib.figure import Figure
 from scipy import stats
 
-ROOT = Path(__file__).resolve().parent.parent
-PUBLISHED = {  # Table 2.1: max, min, avg, std
-    "human": (27, 11, 18.71, 2.86),
-    "DQN": (53, 15, 36.27, 5.44),
-    "BC, α = 0": (29, 3, 17.57, 4.37),
-    "hybrid, α = 0.93": (35, 11, 22.02, 3.70),
-}
-CLIP = 60  # frames: 1 s
+FPS = CLIP = 60  # a clip is 1 s
 
 
 @dataclass
@@ -43,13 +36,6 @@ class Args:
     """folder for tables and figures"""
     likeness_episodes: int = 40
     """episodes of each agent and seed for the measure of human-likeness, half of them held out"""
-
-
-def load_method(name: str):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "cleanrl_thesis" / f"{name}.py")
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def read_runs(folder: Path) -> list[dict]:
@@ -95,79 +81,112 @@ def with_interval(values: list[float], digits: int = 2) -> str:
     return f"{mean:.{digits}f}" + ("" if np.isnan(half) else f" ± {half:.{digits}f}")
 
 
-def human_rows(method, seeds: list[int]) -> list[dict]:
-    """400 episodes of the synthetic human for each seed."""
+def scripted_rows(method, player, seeds: list[int]) -> list[dict]:
+    """400 episodes of a scripted player for each seed; `player` maps a seed to a policy of 400 games."""
     rows = []
     for seed in seeds:
         games = [method.episode_seed(seed, method.EVALUATION_STREAM, i) for i in range(400)]
-        episodes = method.play(method.SyntheticHuman(400, seed), "AppleGame-v0", games)
-        scores = [episode["rewards"].sum() for episode in episodes]
+        scores = [episode["rewards"].sum() for episode in method.play(player(seed), "AppleGame-v0", games)]
         rows.append({"mean": np.mean(scores), "std": np.std(scores), "min": min(scores), "max": max(scores)})
     return rows
 
 
-def table_2_1(rows: list[dict], human: list[dict]) -> str:
+def table_2_1(rows: list[dict], human: list[dict], shortest: list[dict]) -> str:
     """Table 2.1, published beside measured."""
     lines = [
         "| agent | | seeds | max, mean over seeds | min, mean over seeds | avg | std |",
         "|---|---|---|---|---|---|---|",
     ]
     measured = {
-        "human": [("synthetic human", human)],
-        "DQN": [("measured", select(rows, "teacher", "greedy"))],
+        "shortest path": [("scripted", shortest)],
+        "human": [("synthetic", human)],
+        "DQN": [("greedy", select(rows, "teacher", "greedy"))],
         "BC, α = 0": [(mode, select(rows, "alpha0.0", mode)) for mode in ("sampled", "greedy")],
         "hybrid, α = 0.93": [(mode, select(rows, "alpha0.93", mode)) for mode in ("sampled", "greedy")],
         "distilled DQN, α = 1": [(mode, select(rows, "alpha1.0", mode)) for mode in ("sampled", "greedy")],
     }
+    published = published_table()
     for agent, groups in measured.items():
-        if agent in PUBLISHED:
-            lines.append(f"| {agent} | published | 1 | {' | '.join(map(str, PUBLISHED[agent]))} |")
+        if agent in published:
+            cells = [published[agent][name] for name in ("max", "min", "avg", "std")]
+            lines.append(f"| {agent} | **published** | 1 | {' | '.join(cells)} |")
         for name, group in groups:
             if group:
                 columns = [[row[key] for row in group] for key in ("max", "min", "mean", "std")]
-                cells = [f"{np.mean(columns[0]):.0f}", f"{np.mean(columns[1]):.0f}", *map(with_interval, columns[2:])]
+                cells = [f"{np.mean(columns[0]):.1f}", f"{np.mean(columns[1]):.1f}", *map(with_interval, columns[2:])]
                 lines.append(f"| {agent} | {name} | {len(group)} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
-def alpha_curve(rows: list[dict], mode: str, temperature: float = 0.01) -> dict[float, list[float]]:
-    """The seeds' mean scores for each α at a temperature, which α = 0 does not depend on."""
-    curve = defaultdict(list)
+def alpha_curve(
+    rows: list[dict], mode: str, temperature: float = 0.01, group: str = ""
+) -> dict[float, dict[int, float]]:
+    """The mean score for each α and seed at a temperature, which α = 0 does not depend on; `group` begins the folders."""
+    curve = defaultdict(dict)
     for row in rows:
-        is_swept = re.fullmatch(r"(T[\d.]+_)?alpha[\d.]+", row["kind"]) and row["mode"] == mode
+        is_swept = re.fullmatch(group + r"(T[\d.]+_)?alpha[\d.]+", row["kind"]) and row["mode"] == mode
         if is_swept and (row["temperature"] == temperature or row["alpha"] == 0):
-            curve[row["alpha"]].append(row["mean"])
+            curve[row["alpha"]][row["seed"]] = row["mean"]
     return dict(sorted(curve.items()))
 
 
-def temperatures(rows: list[dict]) -> list[float]:
-    return sorted({row["temperature"] for row in rows if row["temperature"] != ""})
+def temperatures(rows: list[dict], group: str = "") -> list[float]:
+    swept = [row for row in rows if re.fullmatch(group + r"(T[\d.]+_)?alpha[\d.]+", row["kind"])]
+    return sorted({row["temperature"] for row in swept if row["alpha"] > 0})
 
 
-def representative_alpha(curve: dict[float, list[float]], human: float) -> float | None:
+def mean_score(scores: dict[int, float]) -> float:
+    return float(np.mean(list(scores.values())))
+
+
+def representative_alpha(curve: dict[float, dict[int, float]], human: float) -> float | None:
     """The thesis' rule: the smallest α tried above 0 whose score is better than the human's."""
-    better = [alpha for alpha, scores in curve.items() if alpha > 0 and np.mean(scores) > human]
+    better = [alpha for alpha, scores in curve.items() if alpha > 0 and mean_score(scores) > human]
     return min(better) if better else None
 
 
-def alpha_table(rows: list[dict], human: float) -> str:
-    lines = ["| α | seeds | sampled | greedy |", "|---|---|---|---|"]
-    sampled, greedy = alpha_curve(rows, "sampled"), alpha_curve(rows, "greedy")
-    for alpha in sampled:
-        cells = (alpha, len(sampled[alpha]), with_interval(sampled[alpha]), with_interval(greedy[alpha]))
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    rule = representative_alpha(sampled, human)
-    lines += [
-        "",
-        f"The rule of the thesis (smallest α tried that beats the human) picks {rule} here; it picked 0.93 there.",
-    ]
+def alpha_table(rows: list[dict], mode: str) -> str:
+    """Fig. 2.4 in numbers: score for each α and temperature."""
+    columns = {f"T = {temperature}": alpha_curve(rows, mode, temperature) for temperature in temperatures(rows)}
+    alphas = sorted({alpha for curve in columns.values() for alpha in curve})
+    lines = [f"| α, {mode} | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
+    for alpha in alphas:
+        cells = [with_interval(list(curve[alpha].values()), 1) if alpha in curve else "" for curve in columns.values()]
+        lines.append(f"| {alpha} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def paired_difference(first: dict[int, float], second: dict[int, float]) -> str:
+    """Difference of the scores of the seeds that both have, with its interval."""
+    difference, half = interval([first[seed] - second[seed] for seed in first.keys() & second.keys()])
+    return f"{difference:+.1f}" + ("" if np.isnan(half) else f" ± {half:.1f}")
+
+
+def shape_table(rows: list[dict], humans: dict[str, float]) -> str:
+    """Dip and rise of each curve of Fig. 2.4, and the α of the thesis' rule."""
+    header = "| human | T | act | α = 0 | lowest, at α | lowest − (α = 0) | (α = 1) − lowest | rule picks α |"
+    lines = [header, "|" + "---|" * 8]
+    for (group, human), mode in itertools.product(humans.items(), ("sampled", "greedy")):
+        for temperature in temperatures(rows, group):
+            curve = alpha_curve(rows, mode, temperature, group)
+            inner = {alpha: mean_score(scores) for alpha, scores in curve.items() if 0 < alpha < 1}
+            if not inner or not {0.0, 1.0} <= curve.keys():
+                continue
+            low = min(inner, key=inner.get)
+            changes = paired_difference(curve[low], curve[0.0]), paired_difference(curve[1.0], curve[low])
+            name = f"{group.strip('_') or 'as published'}, {human:.1f}"
+            lowest = f"{inner[low]:.1f}, {low}"
+            cells = (name, temperature, mode, f"{mean_score(curve[0.0]):.1f}", lowest, *changes)
+            lines.append(f"| {' | '.join(map(str, cells))} | {representative_alpha(curve, human)} |")
     return "\n".join(lines) + "\n"
 
 
 def ablation_table(rows: list[dict]) -> str:
-    """The other temperatures, states and splits beside the main sweep."""
+    """The other states and splits beside the main sweep at the same α."""
     lines = ["| runs | seeds | sampled | greedy | agrees with DQN | with human |", "|---|---|---|---|---|---|"]
-    for kind in sorted({row["kind"] for row in rows if row["mode"] == "sampled"}):
+    kinds = {row["kind"] for row in rows if row["mode"] == "sampled"}
+    others = sorted(kind for kind in kinds if kind.startswith(("own_", "episode_")))
+    for kind in sorted(kinds & {kind.split("_", 1)[1] for kind in others}) + others:
         sampled, greedy = select(rows, kind, "sampled"), select(rows, kind, "greedy")
         columns = [[row["mean"] for row in sampled], [row["mean"] for row in greedy]]
         agreement = [[row[f"test_accuracy_{name}"] for row in sampled] for name in ("rl", "human")]
@@ -176,31 +195,34 @@ def ablation_table(rows: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def figure_2_4(rows: list[dict], human: float) -> Figure:
-    """Score over α, one panel for each way to act, one line for each temperature."""
-    figure = Figure(figsize=(12, 4.6), layout="constrained")
+def figure_2_4(rows: list[dict], humans: dict[str, float]) -> Figure:
+    """Score over α: one row of panels for each human, one column for each way to act, one line for each temperature."""
+    figure = Figure(figsize=(11, 1 + 3.6 * len(humans)), layout="constrained")
     teacher, _ = interval([row["mean"] for row in select(rows, "teacher", "greedy")])
-    published = {0.0: PUBLISHED["BC, α = 0"][2], 0.93: PUBLISHED["hybrid, α = 0.93"][2]}
-    panels = figure.subplots(1, 2, sharey=True)
-    for axes, mode in zip(panels, ("sampled", "greedy")):
-        for i, temperature in enumerate(temperatures(rows)):
-            curve = alpha_curve(rows, mode, temperature)
-            if not curve:
-                continue
-            means, halves = np.array([interval(scores) for scores in curve.values()]).T
-            width = 2.2 if temperature == 0.01 else 1.0
-            axes.plot(
-                list(curve), means, "o-", color=f"C{i}", markersize=3.5, linewidth=width, label=f"T = {temperature}"
-            )
-            low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
-            axes.fill_between(list(curve), low, high, color=f"C{i}", alpha=0.15, linewidth=0)
-        axes.axhline(teacher, color="black", linestyle="--", linewidth=1, label="DQN")
-        axes.axhline(human, color="black", linestyle=":", linewidth=1, label="synthetic human")
-        axes.plot(list(published), list(published.values()), "k*", markersize=9, label="published (Table 2.1)")
-        axes.set(xlabel="α, weight of the DQN", title=f"student, {mode}", ylim=(0, None))
-        axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("apples in 30 s, mean of 400 episodes")
-    figure.legend(*panels[1].get_legend_handles_labels(), fontsize="small", loc="outside right center")
+    published = published_table()
+    stars = {0.0: float(published["BC, α = 0"]["avg"]), 0.93: float(published["hybrid, α = 0.93"]["avg"])}
+    colours = {temperature: f"C{i}" for i, temperature in enumerate(temperatures(rows))}
+    grid = figure.subplots(len(humans), 2, sharex=True, sharey=True, squeeze=False)
+    for panels, (group, human) in zip(grid, humans.items()):
+        for axes, mode in zip(panels, ("sampled", "greedy")):
+            for temperature in temperatures(rows, group):
+                curve = alpha_curve(rows, mode, temperature, group)
+                means, halves = np.array([interval(list(scores.values())) for scores in curve.values()]).T
+                colour = colours[temperature]
+                axes.plot(list(curve), means, "o-", color=colour, markersize=3.5, label=f"T = {temperature}")
+                low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
+                axes.fill_between(list(curve), low, high, color=colour, alpha=0.15, linewidth=0)
+            axes.axhline(teacher, color="black", linestyle="--", linewidth=1, label="DQN")
+            axes.axhline(human, color="black", linestyle=":", linewidth=1, label="this row's human")
+            if not group:
+                axes.plot(list(stars), list(stars.values()), "k*", markersize=9, label="published (Table 2.1)")
+            who = f"{group.strip('_')} synthetic human" if group else "synthetic human"
+            axes.set(title=f"{who}, student {mode}", ylim=(0, None))
+            axes.spines[["top", "right"]].set_visible(False)
+        panels[0].set_ylabel("apples in 30 s, mean of 400 episodes")
+    for axes in grid[-1]:
+        axes.set_xlabel("α, weight of the DQN")
+    figure.legend(*grid[0, 1].get_legend_handles_labels(), fontsize="small", loc="outside right center")
     figure.suptitle("Fig. 2.4: score over α; bands are 95% intervals over seeds")
     return figure
 
@@ -277,21 +299,30 @@ def tell_apart(human: list[dict], agent: list[dict], seed: int) -> float:
     return auc(*scores)
 
 
-def reaction_times(episodes: list[dict]) -> list[int]:
-    """Frames from an apple's appearance to the first change of action, for apples that are there for so long."""
+def reaction_times(episodes: list[dict], moves: np.ndarray) -> list[int]:
+    """Frames from an apple's appearance to the first change to an action that leads nearer to it.
+
+    Apples that are gone before are left out. `moves` (2, 9) are the directions of the actions.
+    """
     times = []
     for episode in episodes:
-        apples, actions = episode["observations"][:-1, 2:4], episode["actions"]
+        apples, ways, actions = *np.split(episode["observations"][:-1, 2:], 2, axis=1), episode["actions"]
         appears = np.flatnonzero((apples[1:] != apples[:-1]).any(1)) + 1
-        changes = np.flatnonzero(actions[1:] != actions[:-1]) + 1
+        nearer = (moves[:, actions].T * ways).sum(1) > 0
+        turns = np.flatnonzero((actions[1:] != actions[:-1]) & nearer[1:]) + 1
         following = np.append(appears[1:], len(actions))
-        first = np.append(changes, len(actions))[np.searchsorted(changes, appears)]
+        first = np.append(turns, len(actions))[np.searchsorted(turns, appears)]
         times += (first - appears)[first < following].tolist()
     return times
 
 
-def changes_per_second(episodes: list[dict]) -> float:
-    return float(np.mean([np.mean(e["actions"][1:] != e["actions"][:-1]) for e in episodes]) * CLIP)
+def direction_changes_per_second(episodes: list[dict]) -> float:
+    """How often the avatar moves on in another direction; standing still between does not count."""
+    changes = 0
+    for episode in episodes:
+        moving = episode["actions"][episode["actions"] != 4]
+        changes += np.count_nonzero(moving[1:] != moving[:-1])
+    return changes * FPS / sum(len(episode["actions"]) for episode in episodes)
 
 
 def likeness_table(method, folder: Path, seeds: list[int], episodes: int) -> str:
@@ -303,10 +334,10 @@ def likeness_table(method, folder: Path, seeds: list[int], episodes: int) -> str
             if name != "human":
                 measures[name]["auc"].append(tell_apart(agents["human"], played, seed))
             measures[name]["score"].append(float(np.mean([episode["rewards"].sum() for episode in played])))
-            measures[name]["reaction"].append(float(np.median(reaction_times(played))) / CLIP * 1000)
-            measures[name]["changes"].append(changes_per_second(played))
+            measures[name]["reaction"].append(float(np.median(reaction_times(played, method.MOVES))) / FPS * 1000)
+            measures[name]["changes"].append(direction_changes_per_second(played))
     lines = [
-        "| agent | seeds | told from the human, AUC | reaction, ms (median) | changes of action per s | score |",
+        "| agent | seeds | told from the human, AUC | reaction, ms (median) | direction changes per s | score |",
         "|---|---|---|---|---|---|",
     ]
     for name, values in measures.items():
@@ -316,6 +347,26 @@ def likeness_table(method, folder: Path, seeds: list[int], episodes: int) -> str
     return "\n".join(lines) + "\n"
 
 
+def write_csv(path: Path, rows: list[dict]) -> None:
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def provenance(runs: Path, rows: list[dict], seeds: list[int]) -> str:
+    """What the results rest on."""
+    count = len({(row["kind"], row["seed"]) for row in rows})
+    hours = sum(row["training_seconds"] for row in rows if row["mode"] == "greedy") / 3600
+    commits = runs / "commits.txt"
+    made_at = ", ".join(dict.fromkeys(commits.read_text().split())) if commits.exists() else "not recorded"
+    return (
+        f"`benchmark/apple_alpha.sh`, commit of the runs: {made_at}; of this report: {commit()}. {count} runs, "
+        f"{hours:.1f} core-hours of training, seeds {', '.join(map(str, seeds))}; each mean is over 400 episodes, each ± "
+        "is a 95% t-interval over seeds.\n\n"
+    )
+
+
 def main(args: Args) -> None:
     torch.set_num_threads(1)
     rows = read_runs(args.runs)
@@ -323,21 +374,25 @@ def main(args: Args) -> None:
         raise SystemExit(f"--runs {args.runs}: holds no finished run")
     method = load_method("distill_hybrid")
     seeds = sorted({row["seed"] for row in rows})
-    human = human_rows(method, seeds)
-    human_score = float(np.mean([row["mean"] for row in human]))
+    quick_human = type("QuickHuman", (method.SyntheticHuman,), QUICK)
+    human = scripted_rows(method, lambda seed: method.SyntheticHuman(400, seed), seeds)
+    quick = scripted_rows(method, lambda seed: quick_human(400, seed), seeds)
+    shortest = scripted_rows(method, lambda seed: shortest_path(method), seeds)
+    humans = {"": float(np.mean([row["mean"] for row in human]))}
+    if any(row["kind"].startswith("quick_") for row in rows):
+        humans["quick_"] = float(np.mean([row["mean"] for row in quick]))
     args.out.mkdir(parents=True, exist_ok=True)
-    with open(args.out / "runs.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    folders = {(row["kind"], row["seed"]) for row in rows}
-    hours = sum(row["training_seconds"] for row in rows if row["mode"] == "greedy") / 3600
-    text = f"{len(folders)} runs, {hours:.1f} core-hours of training, seeds {', '.join(map(str, seeds))}.\n\n"
-    text += f"## Table 2.1\n\n{table_2_1(rows, human)}\n## Score over α\n\n{alpha_table(rows, human_score)}\n"
-    text += f"## Temperature, states and split\n\n{ablation_table(rows)}\n"
-    text += f"## Human-likeness without people\n\n{likeness_table(method, args.runs, seeds, args.likeness_episodes)}"
+    write_csv(args.out / "runs.csv", rows)
+    sections = {
+        "Table 2.1": table_2_1(rows, human, shortest),
+        "Fig. 2.4": alpha_table(rows, "sampled") + "\n" + alpha_table(rows, "greedy"),
+        "Dip, rise and rule": shape_table(rows, humans),
+        "States and split": ablation_table(rows),
+        "Human-likeness without people": likeness_table(method, args.runs, seeds, args.likeness_episodes),
+    }
+    text = provenance(args.runs, rows, seeds) + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
     (args.out / "table.md").write_text(text)
-    figure_2_4(rows, human_score).savefig(args.out / "fig_2_4.png", dpi=130)
+    figure_2_4(rows, humans).savefig(args.out / "fig_2_4.png", dpi=130)
     print(text)
 
 

@@ -1,7 +1,7 @@
 """The report's numbers against scipy and by hand, and the timing tool's table."""
 
 import csv
-import importlib.util
+import importlib
 import json
 import math
 import sys
@@ -11,15 +11,10 @@ import pytest
 from conftest import ROOT
 from scipy import stats
 
-
-def load(name: str):
-    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmark" / f"{name}.py")
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
 
 
-report, speed, apple = load("report"), load("speed"), load("apple_report")
+report, speed, apple = map(importlib.import_module, ("report", "speed", "apple_report"))
 
 
 def test_interval_is_that_of_the_t_test():
@@ -97,35 +92,50 @@ def test_a_player_is_told_from_another_but_not_from_itself():
     assert apple.tell_apart(episodes(0, [3, 5]), episodes(1, [4, 5]), 0) > 0.99
 
 
-def test_reaction_times_and_changes_of_direction():
-    apples = np.repeat([[0.1, 0.1], [0.2, 0.9], [0.7, 0.3]], [5, 10, 6], axis=0)
-    observations = np.concatenate([np.zeros((21, 2)), apples, np.zeros((21, 2))], 1)
-    actions = np.array([4] * 5 + [4] * 3 + [5] * 7 + [5] * 5)  # new apples at 5 and 15; a change at 8 alone
-    episode = {"observations": observations, "actions": actions}
-    assert apple.reaction_times([episode]) == [3]
-    assert math.isclose(apple.changes_per_second([episode]), 60 / 19)
+def test_reaction_is_the_first_change_that_leads_nearer():
+    apples = np.repeat([[0.1, 0.1], [0.2, 0.9], [0.7, 0.3]], [5, 10, 9], axis=0)
+    ways = np.repeat([[-1.0, 0.0], [0.5, 0.0], [-0.5, 0.2]], [5, 10, 9], axis=0)
+    observations = np.concatenate([np.zeros((24, 2)), apples, ways], 1)
+    # moving left as the second apple comes at 5: lets go at 6, goes up at 7, right at 9; never turns to the third
+    actions = np.array([3] * 6 + [4] + [1] * 2 + [5] * 15)
+    moves = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]).T
+    episode = {"observations": np.concatenate([observations, observations[-1:]]), "actions": actions}
+    assert apple.reaction_times([episode], moves) == [4]
+
+
+def test_direction_changes_do_not_count_standing_still():
+    episode = {"actions": np.array([4, 5, 5, 4, 5, 3, 4, 4, 8, 8])}  # right, left, down and right
+    assert math.isclose(apple.direction_changes_per_second([episode, episode]), 2 * 60 / 10)
 
 
 def test_the_rule_picks_the_smallest_alpha_that_beats_the_human():
-    curve = {0.0: [20.0, 20.0], 0.5: [12.0, 13.0], 0.8: [19.0, 18.9], 0.93: [21.0, 17.0], 1.0: [30.0, 31.0]}
+    scores = {0.0: (20.0, 20.0), 0.5: (12.0, 13.0), 0.8: (19.0, 18.9), 0.93: (21.0, 17.0), 1.0: (30.0, 31.0)}
+    curve = {alpha: dict(enumerate(pair)) for alpha, pair in scores.items()}
     assert apple.representative_alpha(curve, 18.71) == 0.8
     assert apple.representative_alpha(curve, 40.0) is None
 
 
 def test_a_curve_has_the_runs_of_its_temperature():
     rows = [
-        {"kind": kind, "alpha": alpha, "temperature": temperature, "mode": mode, "mean": mean}
+        {"kind": kind, "alpha": alpha, "temperature": temperature, "mode": mode, "mean": mean, "seed": 1}
         for kind, alpha, temperature, mode, mean in [
             ("alpha0.0", 0.0, 0.01, "sampled", 1),
             ("alpha0.5", 0.5, 0.01, "sampled", 2),
             ("alpha0.5", 0.5, 0.01, "greedy", 3),
             ("T1_alpha0.5", 0.5, 1.0, "sampled", 4),
             ("own_alpha0.5", 0.5, 0.01, "sampled", 5),
+            ("quick_T2_alpha0.5", 0.5, 2.0, "sampled", 6),
         ]
     ]
-    assert apple.alpha_curve(rows, "sampled") == {0.0: [1], 0.5: [2]}
-    assert apple.alpha_curve(rows, "sampled", 1.0) == {0.0: [1], 0.5: [4]}
+    assert apple.alpha_curve(rows, "sampled") == {0.0: {1: 1}, 0.5: {1: 2}}
+    assert apple.alpha_curve(rows, "sampled", 1.0) == {0.0: {1: 1}, 0.5: {1: 4}}
+    assert apple.alpha_curve(rows, "sampled", 2.0, "quick_") == {0.5: {1: 6}}
     assert apple.temperatures(rows) == [0.01, 1.0]
+
+
+def test_differences_are_of_the_seeds_that_both_have():
+    first, second = {1: 3.0, 2: 5.0, 3: 9.0}, {3: 1.0, 1: 2.0, 4: 50.0}
+    assert apple.paired_difference(first, second) == f"{4.5:+.1f} ± {stats.t.ppf(0.975, 1) * 3.5:.1f}"
 
 
 def test_interval_of_the_seeds_is_that_of_the_t_distribution():
