@@ -233,7 +233,7 @@ def figure_2_4(rows: list[dict], humans: dict[str, float]) -> Figure:
 def load_student(method, folder: Path):
     with safetensors.safe_open(folder / "model.safetensors", "pt") as file:
         args = json.loads(file.metadata()["args"])
-    student = method.Student(6, 9, args["hidden_size"])
+    student = method.Student((6,), 9, args["hidden_size"])
     student.load_state_dict(safetensors.torch.load_file(folder / "model.safetensors"))
     return student
 

@@ -118,7 +118,8 @@ class Args:
 
     # Algorithm
     env_id: str = "AppleGame-v0"
-    """the environment: AppleGame-v0, or with `--demos` a Gymnasium id with flat Box observations and Discrete actions"""
+    """the environment: AppleGame-v0, or with `--demos` a Gymnasium id with flat Box or image observations (channels
+    first, uint8) and Discrete actions"""
     teacher: Path | None = None
     """folder of the DQN's run, with `model.safetensors`; needed for α > 0"""
     demos: Path | None = None
@@ -377,15 +378,22 @@ if "AppleGame-v0" not in gym.registry:
     gym.register("AppleGame-v0", AppleGameEnv, vector_entry_point=AppleGameVectorEnv)
 
 
+def is_image(space: gym.Space) -> bool:
+    """Whether observations are images, (C, H, W) uint8, large enough for the convolutions."""
+    shape = space.shape if isinstance(space, gym.spaces.Box) and space.dtype == np.uint8 else ()
+    return len(shape) == 3 and min(shape[1:]) >= 36
+
+
 def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
-    """Make an environment with flat `Box` observations and `Discrete` actions. Raises UsageError."""
+    """Make an environment with flat `Box` or image observations and `Discrete` actions. Raises UsageError."""
     try:
         env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True)
     except (gym.error.Error, ImportError, TypeError, ValueError) as error:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     space, actions = env.observation_space, env.action_space
     is_flat = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-    require(is_flat, "--env-id", env_id, f"needs flat Box observations, this one has {space}")
+    allowed = "needs flat Box observations or images, (C, H, W) uint8 and at least 36 x 36; this one has"
+    require(is_flat or is_image(space), "--env-id", env_id, f"{allowed} {space}")
     is_discrete = isinstance(actions, gym.spaces.Discrete) and actions.start == 0
     require(is_discrete, "--env-id", env_id, f"needs Discrete actions from 0, this one has {actions}")
     return env
@@ -408,7 +416,7 @@ class SyntheticHuman:
     hold_spread, hold_error, shortest_hold = 0.12, 2.0, 4.0  # of a key press: as a share, in frames, and the least
     pause, pause_spread = 9.0, 0.3  # median time from letting go of a key to the next look, and its deviation
     slip = 0.02  # how often the opposite key is pressed
-    tolerance = 0.5 * float(REACH)  # distance on an axis that it takes for none
+    tolerance = 0.5  # distance on an axis that it takes for none, as a share of the reach
 
     def __init__(self, num_games: int, seed: int):
         self.rng = np.random.default_rng(np.random.SeedSequence([seed, HUMAN_STREAM]))
@@ -450,7 +458,7 @@ class SyntheticHuman:
         ways = (self.aims - avatars)[games, axes]
         spread, error, rest = self.rng.standard_normal((3, len(games)))
         slips = self.rng.random(len(games)) < self.slip
-        presses = (self.keys[games, axes] == 0) & (np.abs(ways) > self.tolerance)
+        presses = (self.keys[games, axes] == 0) & (np.abs(ways) > self.tolerance * float(REACH))
         pauses = self.pause * np.exp(self.pause_spread * rest)
         holds = np.abs(ways) / float(SPEED) * np.exp(self.hold_spread * spread) + self.hold_error * error
         holds = np.where(slips, pauses, np.maximum(holds, self.shortest_hold))
@@ -482,7 +490,7 @@ def episode_seed(seed: int, stream: int, episode: int) -> int:
 class Frames(NamedTuple):
     """F frames of play."""
 
-    obs: np.ndarray  # (F, O) float32
+    obs: np.ndarray  # (F, O) float32, or images (F, C, H, W) uint8
     actions: np.ndarray  # (F,) int64
     episodes: np.ndarray  # (F,), number of the episode of each frame
 
@@ -492,7 +500,8 @@ def join_frames(episodes: list[dict[str, np.ndarray]], frames: int) -> Frames:
     numbers = [np.full(len(episode["actions"]), i) for i, episode in enumerate(episodes)]
     obs = np.concatenate([episode["observations"][:-1] for episode in episodes])
     actions = np.concatenate([episode["actions"] for episode in episodes])
-    return Frames(obs[:frames].astype(np.float32), actions[:frames].astype(np.int64), np.concatenate(numbers)[:frames])
+    obs = obs[:frames] if obs.ndim == 4 else obs[:frames].astype(np.float32)
+    return Frames(obs, actions[:frames].astype(np.int64), np.concatenate(numbers)[:frames])
 
 
 def read_episode(path: Path, checksum: str, env: gym.Env) -> dict[str, np.ndarray]:
@@ -514,6 +523,8 @@ def read_episode(path: Path, checksum: str, env: gym.Env) -> dict[str, np.ndarra
     require(fits, "--demos", path, f"{allowed} {observations.shape} and {actions.shape}")
     finite = np.issubdtype(observations.dtype, np.number) and bool(np.isfinite(observations).all())
     require(finite, "--demos", path, "observations must be finite numbers")
+    same_kind = not is_image(env.observation_space) or observations.dtype == np.uint8
+    require(same_kind, "--demos", path, f"observations must be uint8, they are {observations.dtype}")
     number = int(env.action_space.n)
     inside = np.issubdtype(actions.dtype, np.integer) and bool(((actions >= 0) & (actions < number)).all())
     require(inside, "--demos", path, f"actions must be whole numbers from 0 to {number - 1}")
@@ -612,19 +623,30 @@ def load_teacher(folder: Path, env_id: str) -> QNetwork:
 # ---------------------------------------------------------------------------------------------------------------------
 # The algorithm
 # ---------------------------------------------------------------------------------------------------------------------
-class Student(nn.Module):
-    """π(a|s) as a network of two hidden layers."""
+def convolutions(channels: int) -> nn.Sequential:
+    """The convolutions of Mnih et al. (2015), for images (M, C, H, W) uint8."""
+    layers = nn.Conv2d(channels, 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)
+    return nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())), nn.Flatten())
 
-    def __init__(self, obs_dim: int, num_actions: int, hidden_size: int):
+
+class Student(nn.Module):
+    """π(a|s) as a network of two hidden layers, over convolutions where observations are images."""
+
+    def __init__(self, obs_shape: tuple[int, ...], num_actions: int, hidden_size: int):
         super().__init__()
+        self.convolutions, features = None, obs_shape[0]
+        if len(obs_shape) == 3:
+            self.convolutions = convolutions(obs_shape[0])
+            features = self.convolutions(torch.zeros(1, *obs_shape)).shape[1]
         self.layers = nn.ModuleList(
-            [nn.Linear(obs_dim, hidden_size), nn.Linear(hidden_size, hidden_size), nn.Linear(hidden_size, num_actions)]
+            [nn.Linear(features, hidden_size), nn.Linear(hidden_size, hidden_size), nn.Linear(hidden_size, num_actions)]
         )
 
     def forward(self, obs: torch.Tensor, masks: torch.Tensor | None = None) -> torch.Tensor:
-        """Observations (M, O) -> logits (M, A); `masks` (2, M, H) multiply the hidden units (dropout)."""
+        """Observations (M, O), or (M, C, H, W) uint8 -> logits (M, A); `masks` (2, M, H) multiply the hidden units."""
         first, second, output = self.layers
-        hidden = torch.relu(first(obs))
+        features = obs.float() if self.convolutions is None else self.convolutions(obs / 255)
+        hidden = torch.relu(first(features))
         hidden = torch.relu(second(hidden if masks is None else hidden * masks[0]))
         return output(hidden if masks is None else hidden * masks[1])
 
@@ -656,9 +678,9 @@ def hybrid_loss(
 class Data(NamedTuple):
     """F frames to learn from; row i of the first two and of the last two need not be the same frame."""
 
-    rl_obs: torch.Tensor  # (F, O), states of the DQN's term
+    rl_obs: torch.Tensor  # (F, O) or images, states of the DQN's term
     rl_labels: torch.Tensor  # (F, A), π_RL⁽ᵀ⁾ there
-    he_obs: torch.Tensor  # (F, O), states of the human's term
+    he_obs: torch.Tensor  # (F, O) or images, states of the human's term
     he_actions: torch.Tensor  # (F,)
 
     def at(self, frames: torch.Tensor) -> "Data":
@@ -758,7 +780,9 @@ class Update:
 @torch.no_grad()
 def measure(student: Student, data: Data, args: Args) -> dict[str, float]:
     """Loss and agreement with each teacher on frames that are not trained on."""
-    rl_logits, he_logits = student(data.rl_obs), student(data.he_obs)
+    rl_logits, he_logits = (
+        torch.cat([student(part) for part in obs.split(5_000)]) for obs in (data.rl_obs, data.he_obs)
+    )
     loss, _ = hybrid_loss(rl_logits, data.rl_labels, he_logits, data.he_actions, args.alpha)
     agrees_rl = (rl_logits.argmax(1) == data.rl_labels.argmax(1)).float().mean().item()
     agrees_he = (he_logits.argmax(1) == data.he_actions).float().mean().item()
@@ -855,7 +879,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing in it has changed.
+    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -1000,15 +1024,13 @@ def check_video(env_id: str) -> None:
 
 
 def numpy_policy(student: Student, mode: str, seed: int):
-    """The policy as a numpy function, (N, O) -> (N,): sampled, or its most probable action."""
-    layers = [(layer.weight.detach().cpu().numpy().T, layer.bias.detach().cpu().numpy()) for layer in student.layers]
+    """The policy as a function of numpy arrays, observations (N, O) or images -> (N,): sampled, or its best action."""
+    device = next(student.parameters()).device
     rng = np.random.default_rng([seed, 1])
 
-    def policy(x: np.ndarray) -> np.ndarray:
-        for weight, bias in layers[:-1]:
-            x = np.maximum(x.dot(weight) + bias, 0)
-        weight, bias = layers[-1]
-        logits = x.dot(weight) + bias
+    @torch.no_grad()
+    def policy(obs: np.ndarray) -> np.ndarray:
+        logits = student(torch.from_numpy(obs).to(device)).cpu().numpy()
         if mode == "sampled":
             logits = logits + rng.gumbel(size=logits.shape)  # the largest of these is a sample of the softmax
         return logits.argmax(1)
@@ -1212,7 +1234,7 @@ def main(args: Args) -> int:
     stop = StopSignal()
 
     training, test = (Data(*(column[rows].to(device) for column in data)) for rows in (~is_test, is_test))
-    student = Student(data.he_obs.shape[1], data.rl_labels.shape[1], args.hidden_size).to(device)
+    student = Student(tuple(data.he_obs.shape[1:]), data.rl_labels.shape[1], args.hidden_size).to(device)
     update = Update(student, args, training.at(torch.arange(min(args.batch_size, len(training.he_obs)))))
     arithmetic = f"{'compiled' if update.step is not update.plain_step else 'plain'} on {device.type}"
     best = {"vector": update.vector.clone(), "accuracy": -1.0, "epoch": 0, **dict.fromkeys(("rl", "human"), 0.0)}

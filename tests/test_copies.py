@@ -16,6 +16,7 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("FlatAdam", DQN): "one learning rate; the vector of the target network beside the agent's",
     ("PlainUpdate", DQN): "has a target network, and a minibatch of transitions",
     ("make_env", PPO): "Box actions instead of Discrete ones, and MuJoCo's islands",
+    ("make_env", DISTILL): "image observations too",
     ("make_update", DQN): "has a target network",
     ("numpy_policy", PPO): "the mean of a Gaussian instead of an action",
     ("play", PPO): "one environment and normalised observations; the discrete methods play many games side by side",

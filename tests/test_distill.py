@@ -1,8 +1,10 @@
 """The hybrid loss, its labels and its update, and the synthetic human, against independent sources."""
 
+import json
 import math
 import subprocess
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -76,7 +78,7 @@ def test_dropout_masks_keep_the_mean():
 def make_update(**settings):
     args = distill.complete_args(distill.Args(teacher=".", hidden_size=32, **settings))
     torch.manual_seed(0)
-    student = distill.Student(6, 9, 32)
+    student = distill.Student((6,), 9, 32)
     generator = torch.Generator().manual_seed(1)
     rl_obs, he_obs = torch.rand(2, 64, 6, generator=generator)
     labels = torch.softmax(torch.randn(64, 9, generator=generator), 1)
@@ -122,7 +124,7 @@ def test_compiled_update_is_the_plain_one():
 
 @pytest.mark.parametrize("mode", ["sampled", "greedy"])
 def test_numpy_policy_is_the_students(mode):
-    student = distill.Student(6, 9, 32)
+    student = distill.Student((6,), 9, 32)
     obs = torch.rand(1, 6).repeat(20_000, 1)
     actions = distill.numpy_policy(student, mode, 0)(obs.numpy())
     with torch.no_grad():
@@ -131,6 +133,61 @@ def test_numpy_policy_is_the_students(mode):
         assert set(actions) == {int(probabilities.argmax())}
     else:
         assert np.allclose(np.bincount(actions, minlength=9) / 20_000, probabilities, atol=0.015)
+
+
+class Quadrants(gym.Env):
+    """Images with a bright square in one quarter, two frames of them; the action that names it earns 1, 20 times."""
+
+    observation_space = gym.spaces.Box(0, 255, (2, 40, 40), np.uint8)
+    action_space = gym.spaces.Discrete(4)
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def draw(self) -> np.ndarray:
+        self.quarter = int(self.np_random.integers(4))
+        obs = self.np_random.integers(0, 100, (2, 40, 40), dtype=np.uint8)
+        y, x = 20 * (self.quarter // 2) + 5, 20 * (self.quarter % 2) + 5
+        obs[:, y : y + 10, x : x + 10] = 255
+        return obs
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.draw(), {}
+
+    def step(self, action):
+        reward = float(action == self.quarter)
+        self.steps += 1
+        return self.draw(), reward, False, self.steps == 20, {}
+
+
+@pytest.mark.parametrize("flags", [[], ["--compile", "--split", "episode"]])
+def test_a_student_of_images_learns_from_recordings(tmp_path, monkeypatch, flags):
+    """The convolutional student, from demonstrations of a player who looks at the brightest quarter."""
+    monkeypatch.setitem(gym.registry, "Quadrants-v0", gym.envs.registration.EnvSpec("Quadrants-v0", Quadrants))
+
+    def look(obs):
+        return obs.reshape(len(obs), 2, 2, 20, 2, 20).mean((1, 3, 5)).reshape(len(obs), 4).argmax(1)
+
+    episodes = distill.play(look, "Quadrants-v0", list(range(30)), keep=True)
+    assert all(episode["rewards"].sum() == 20 for episode in episodes)
+    (tmp_path / "demos").mkdir()
+    distill.write_demonstrations(tmp_path / "demos", episodes, {"env_id": "Quadrants-v0", "player": "a", "mode": "b"})
+    sizes = ["--demo-frames", "600", "--test-frames", "100", "--epochs", "6", "--learning-rate", "1e-3"]
+    command = ["--env-id", "Quadrants-v0", "--alpha", "0", "--demos", str(tmp_path / "demos"), *sizes, *flags]
+    assert distill.cli([*command, "--eval-episodes", "20", "--run-dir", str(tmp_path / "run")]) == 0
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["evaluation"]["greedy"]["mean"] > 18
+
+
+def test_recorded_images_must_be_bytes(tmp_path, monkeypatch):
+    monkeypatch.setitem(gym.registry, "Quadrants-v0", gym.envs.registration.EnvSpec("Quadrants-v0", Quadrants))
+    episodes = distill.play(lambda obs: np.zeros(len(obs), int), "Quadrants-v0", [0], keep=True)
+    episodes[0]["observations"] = episodes[0]["observations"] / 255
+    distill.write_demonstrations(tmp_path, episodes, {"env_id": "Quadrants-v0", "player": "a", "mode": "b"})
+    with pytest.raises(distill.UsageError, match="must be uint8, they are float64"):
+        distill.read_demonstrations(tmp_path, "Quadrants-v0")
 
 
 # The synthetic human
@@ -173,5 +230,5 @@ def test_every_line_of_the_sweep_is_one_run(tmp_path):
     calls = (tmp_path / "calls").read_text().splitlines()
     assert sum("dqn_apple.py" in call for call in calls) == 2
     students = [call for call in calls if "distill_hybrid.py" in call]
-    assert len(students) == len(set(students)) == 2 * (12 + 5 * 6 + 3 + 2)
+    assert len(students) == len(set(students)) == 2 * (12 + 5 * 7 + 3 + 2 + 13)
     assert all(call.count("--seed") == call.count("--run-dir") == 1 for call in students)
