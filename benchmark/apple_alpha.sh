@@ -8,6 +8,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
 ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
+OTHER_ALPHAS=${OTHER_ALPHAS:-0.93 1.0 0.5 0.7 0.8 0.3 0.9}
 mkdir -p "$RUNS"
 git rev-parse --short HEAD >> "$RUNS/commits.txt"
 for seed in $SEEDS; do
@@ -25,18 +26,21 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
     for alpha in $ALPHAS; do student "$seed" "$alpha" "alpha$alpha"; done
   done
   for seed in $SEEDS; do
-    for temperature in 0 0.1 0.5 1 2; do
-      for alpha in 0.93 1.0 0.5 0.7 0.8 0.3 0.9; do
-        student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"
+    for alpha in $OTHER_ALPHAS; do student "$seed" "$alpha" "T0.5_alpha$alpha" --temperature 0.5; done
+    quick=(--demos "$RUNS/quick_demos_seed$seed")
+    student "$seed" 0.0 quick_alpha0.0 "${quick[@]}"
+    for temperature in 0.01 0.5; do
+      for alpha in 0.93 1.0 0.5 0.7 0.8 0.3; do
+        student "$seed" "$alpha" "quick_T${temperature}_alpha$alpha" --temperature "$temperature" "${quick[@]}"
       done
     done
     for alpha in 0.5 0.93 1.0; do student "$seed" "$alpha" "own_alpha$alpha" --states own; done
     for alpha in 0.0 0.93; do student "$seed" "$alpha" "episode_alpha$alpha" --split episode; done
-    quick=(--demos "$RUNS/quick_demos_seed$seed")
-    student "$seed" 0.0 quick_alpha0.0 "${quick[@]}"
-    for temperature in 0.01 0.5; do
-      for alpha in 0.3 0.5 0.7 0.8 0.93 1.0; do
-        student "$seed" "$alpha" "quick_T${temperature}_alpha$alpha" --temperature "$temperature" "${quick[@]}"
+  done
+  for seed in $SEEDS; do
+    for temperature in 0 0.1 1 2; do
+      for alpha in $OTHER_ALPHAS; do
+        student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"
       done
     done
   done
