@@ -9,15 +9,15 @@ L_mix(π) = α E_s[− Σ_a π_RL⁽ᵀ⁾(a|s) log π(a|s)] + (1 − α) E_s[�
 softmax at temperature T (soft labels) and against the human's actions (hard labels), both over the human's states.
 
 The teacher is a run of `dqn_apple.py --save-model`. The human is by default a **synthetic** one: a script with a
-reaction time, motor noise, keys that are held too long or too short, slips and lapses, calibrated to the human row of
-Table 2.1; it is made from no agent. `--demos` takes recordings instead. `--run-dir DIR --resume` can be sent again after
+reaction time, motor noise, keys that are held too long or too short, slips and lapses, calibrated to the mean of Table
+2.1's human row; it is made from no agent. `--demos` takes recordings instead. `--run-dir DIR --resume` can be sent again after
 every crash: on the same machine the run ends with the same bytes.
 
 | setting | value | source |
 |---|---|---|
 | frames, for testing | 16,000, of them 1,500 drawn at random | section 2.4.1 |
 | Adam's learning rate, dropout, α | 1e-4, 0.5, 0.93 | section 2.4.1 |
-| which network is kept | the one with the best test accuracy, α · (agrees with the DQN) + (1 − α) · (with the human) | section 2.4.1 says test accuracy |
+| which network is kept | the one with the best test accuracy, α · (agrees with the DQN) + (1 − α) · (with the human); the last one is evaluated too | section 2.4.1 says test accuracy |
 | T, network, batch, epochs | 0.01, 256-256 with ReLU, 64, 100 | ours, not given; benchmark/apple_alpha.sh compares T |
 | split | by frame: neighbours of a test frame are trained on; `--split episode` keeps whole episodes apart | section 2.4.1; ours |
 """
@@ -123,7 +123,7 @@ class Args:
     teacher: Path | None = None
     """folder of the DQN's run, with `model.safetensors`; needed for α > 0"""
     demos: Path | None = None
-    """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_human/`"""
+    """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_synthetic_human/`"""
     demo_frames: int = 16_000
     """frames of the human, and with `--states own` of the DQN (section 2.4.1)"""
     test_frames: int = 1_500
@@ -219,7 +219,7 @@ def complete_args(args: Args) -> Args:
 # The Apple game
 # ---------------------------------------------------------------------------------------------------------------------
 FPS, EPISODE_FRAMES = 60, 1_800  # an episode is 30 s
-SPEED = np.float32(0.00825)  # sides of the plane, per frame and axis; made by benchmark/apple_players.py
+SPEED = np.float32(0.00825)  # sides of the plane, per frame and axis; chosen by hand, see benchmark/apple_players.py
 REACH = np.float32(0.06)  # distance at which an apple is taken, in sides of the plane
 LIFETIME = 90  # frames until an apple that nobody takes is gone
 MOVES = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.float32).T  # (2, 9); action 4 stays
@@ -407,7 +407,7 @@ class SyntheticHuman:
 
     It notices an apple after a reaction time. Then it presses the key of each axis, of one a little later than of the
     other, for as long as the way seems to need; looks where that has led, and corrects. Times are in frames. Calibrated
-    to the human row of Table 2.1, 18.71 ± 2.86, by benchmark/apple_players.py.
+    by hand to the mean of Table 2.1's human row, 18.71 ± 2.86: 18.8 ± 3.4 as measured by benchmark/apple_players.py.
     """
 
     reaction, reaction_spread = 17.0, 0.25  # median time to notice a new apple, and its deviation as a share
@@ -537,9 +537,10 @@ def read_demonstrations(folder: Path, env_id: str) -> list[dict[str, np.ndarray]
     """All episodes of a folder, in the order of their names. Raises UsageError."""
     try:
         manifest = json.loads((folder / "manifest.json").read_text())
-        files, recorded = dict(manifest["files"]), str(manifest["env_id"])
+        files, recorded, version = dict(manifest["files"]), str(manifest["env_id"]), manifest["version"]
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"--demos {folder}: holds no demonstrations, it has no readable manifest.json") from None
+    require(version == 1, "--demos", folder, f"its manifest is of version {version}, this script reads version 1")
     require(bool(files), "--demos", folder, "holds no demonstrations, its manifest names no file")
     same_game = recorded.split(":")[-1] == env_id.split(":")[-1]
     require(same_game, "--demos", folder, f"was recorded in {recorded}, --env-id is {env_id}")
@@ -729,7 +730,7 @@ class Update:
         self.count = torch.zeros((), device=self.vector.device)
         for parameter, value in zip(student.parameters(), views(self.vector, self.shapes)):
             parameter.data = value
-        self.step = self.plain_step
+        self.step, self.is_compiled = self.plain_step, False
         if args.compile:
             self.compile(minibatch)
 
@@ -746,7 +747,7 @@ class Update:
             with torch.no_grad():  # compiles, and changes nothing but copies
                 compiled(*(tensor.clone() for tensor in self.state_dict().values()), minibatch, masks)
             torch.compiler.set_stance("default", skip_guard_eval_unsafe=True)  # every call is alike
-            self.step = compiled
+            self.step, self.is_compiled = compiled, True
         except Exception as error:  # whatever the compiler's tool chain lacks, the plain step needs none of it
             print(f"--compile: failed ({first_line(error)}), goes on without", file=sys.stderr)
 
@@ -1043,21 +1044,26 @@ def record_video(student: Student, args: Args, run_dir: Path, seed: int) -> None
     env = gym.wrappers.RecordVideo(make_env(args.env_id, "rgb_array"), str(run_dir / "videos"), lambda episode: True)
     policy = numpy_policy(student, args.eval_mode, seed)
     obs, _ = env.reset(seed=seed)
-    ended = False
-    while not ended:
+    for _ in range(MAX_EVALUATION_STEPS):
         obs, _, terminated, truncated, _ = env.step(int(policy(obs[None])[0]))
-        ended = terminated or truncated
+        if terminated or truncated:
+            break
     env.close()
 
 
-def evaluate(student: Student, args: Args, run_dir: Path) -> dict:
-    """Play `--eval-episodes` episodes in each mode; write `evaluation.json` and, if asked, a video."""
+def evaluate(student: Student, update: Update, networks: dict[str, torch.Tensor], args: Args, run_dir: Path) -> dict:
+    """Play `--eval-episodes` episodes with each network in each mode; write `evaluation.json` and, if asked, a video.
+
+    `networks` are vectors of parameters by what is put before the mode's name; the student is left with the last.
+    """
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
     evaluation = {"env_id": args.env_id, "seeds": seeds}
-    for mode in ("sampled", "greedy"):
-        episodes = play(numpy_policy(student, mode, args.seed), args.env_id, seeds)
-        returns = [float(episode["rewards"].sum()) for episode in episodes]
-        evaluation[mode] = {"mode": mode, **summary(returns), "returns": returns}
+    for name, vector in networks.items():
+        update.vector.copy_(vector)
+        for mode in ("sampled", "greedy"):
+            episodes = play(numpy_policy(student, mode, args.seed), args.env_id, seeds)
+            returns = [float(episode["rewards"].sum()) for episode in episodes]
+            evaluation[name + mode] = {"mode": mode, **summary(returns), "returns": returns}
     if args.capture_video:
         record_video(student, args, run_dir, seeds[0])
     write_json(run_dir / "evaluation.json", evaluation)
@@ -1080,7 +1086,11 @@ def save_demonstrations(student: Student, args: Args, run_dir: Path) -> None:
 
 
 def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
-    """Write episodes in the format of `save_demonstrations`; `about` goes into the manifest."""
+    """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
+
+    Each file has observations (T + 1, ...), actions (T,), rewards (T,), terminated, truncated, seed, and t_ns (T,), the
+    time of each action in nanoseconds, simulated where the environment says how many frames a second has.
+    """
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))
     manifest = {"version": 1, **about, "files": {}}
@@ -1101,7 +1111,10 @@ def plot_learning_curve(run_dir: Path, args: Args, best_epoch: int) -> None:
     epochs = [int(row["global_step"]) for row in rows]
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
-    lines = {"test/accuracy_rl": "with the DQN's best action", "test/accuracy_human": "with the human's action"}
+    lines = {
+        "test/accuracy_rl": "with the DQN's best action",
+        "test/accuracy_human": f"with the {'synthetic human' if args.demos is None else 'human'}'s action",
+    }
     for name, label in lines.items():
         if name != "test/accuracy_rl" or args.teacher is not None:
             axes.plot(epochs, [float(row[name]) for row in rows], label=label)
@@ -1117,12 +1130,12 @@ def plot_learning_curve(run_dir: Path, args: Args, best_epoch: int) -> None:
 
 
 def print_table(result: dict) -> None:
-    """Print the human's episodes and the student's, sampled and greedy, one line each."""
+    """Print the human's episodes and the student's, of the kept and of the last network, one line each."""
     print(f"{'':32}{'episodes':>9}{'mean':>11}{'std':>11}{'min':>11}{'max':>11}")
-    for name, row in (
-        ("human", result["human"]),
-        *((mode, result["evaluation"][mode]) for mode in ("sampled", "greedy")),
-    ):
+    rows = {f"human ({result['human']['player']})": result["human"]}
+    rows |= {f"student, {mode}": result["evaluation"][mode] for mode in ("sampled", "greedy")}
+    rows |= {f"of the last epoch, {mode}": result["evaluation"][f"last_{mode}"] for mode in ("sampled", "greedy")}
+    for name, row in rows.items():
         numbers = "".join(f"{row[key]:>11.1f}" for key in ("mean", "std", "min", "max") if row[key] is not None)
         print(f"{name:32}{row['episodes']:>9}{numbers}")
 
@@ -1218,11 +1231,10 @@ def main(args: Args) -> int:
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
     write_json(run_dir / "args.json", arguments(args))
-    (run_dir / "result.json").unlink(missing_ok=True)
     print(run_dir)
     if args.demos is None:
         about = {"env_id": args.env_id, "player": "synthetic human", "mode": "scripted"}
-        write_demonstrations(run_dir / "demos_human", human_episodes, about)
+        write_demonstrations(run_dir / "demos_synthetic_human", human_episodes, about)
 
     random.seed(args.seed)  # this file draws from neither; for environments that do
     np.random.seed(args.seed)
@@ -1236,7 +1248,7 @@ def main(args: Args) -> int:
     training, test = (Data(*(column[rows].to(device) for column in data)) for rows in (~is_test, is_test))
     student = Student(tuple(data.he_obs.shape[1:]), data.rl_labels.shape[1], args.hidden_size).to(device)
     update = Update(student, args, training.at(torch.arange(min(args.batch_size, len(training.he_obs)))))
-    arithmetic = f"{'compiled' if update.step is not update.plain_step else 'plain'} on {device.type}"
+    arithmetic = f"{'compiled' if update.is_compiled else 'plain'} on {device.type}"
     best = {"vector": update.vector.clone(), "accuracy": -1.0, "epoch": 0, **dict.fromkeys(("rl", "human"), 0.0)}
     epoch, training_seconds, offset = 0, 0.0, 0
     if checkpoint is not None:
@@ -1248,6 +1260,7 @@ def main(args: Args) -> int:
             was = checkpoint["arithmetic"]
             print(f"--resume: was {was}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     updates_csv = CsvLog(run_dir / "updates.csv", offset)
+    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
     writer = SummaryWriter(str(run_dir), purge_step=epoch + 1)
@@ -1290,19 +1303,29 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    update.vector.copy_(best["vector"])
-    human_summary = summary([float(episode["rewards"].sum()) for episode in human_episodes])
-    finish_run(student, args, run_dir, epoch, training_seconds, best, human_summary, writer)
+    human_returns = [float(episode["rewards"].sum()) for episode in human_episodes]
+    human_summary = {"player": "synthetic human" if args.demos is None else "recorded", **summary(human_returns)}
+    finish_run(student, update, args, run_dir, epoch, training_seconds, best, human_summary, writer)
     writer.close()
     return 0
 
 
 def finish_run(
-    student: Student, args: Args, run_dir: Path, epoch: int, seconds: float, best: dict, human: dict, writer
+    student: Student,
+    update: Update,
+    args: Args,
+    run_dir: Path,
+    epoch: int,
+    seconds: float,
+    best: dict,
+    human: dict,
+    writer,
 ) -> None:
     """Evaluate, draw, save what was asked for, and write `result.json` last."""
-    evaluation = evaluate(student, args, run_dir)
-    for mode in ("sampled", "greedy"):
+    networks = {"last_": update.vector.clone(), "": best["vector"]}
+    evaluation = evaluate(student, update, networks, args, run_dir)
+    modes = [name + mode for name in networks for mode in ("sampled", "greedy")]
+    for mode in modes:
         for name in ("mean", "std", "min", "max"):
             writer.add_scalar(f"eval/episodic_return_{name}_{mode}", evaluation[mode][name], epoch)
     if args.save_model:
@@ -1312,7 +1335,6 @@ def finish_run(
         save_demonstrations(student, args, run_dir)
     plot_learning_curve(run_dir, args, best["epoch"])
     versions = {module.__name__: module.__version__ for module in (gym, np, torch)}
-    modes = ("sampled", "greedy")
     result = {
         "env_id": args.env_id,
         "seed": args.seed,
@@ -1331,6 +1353,7 @@ def finish_run(
         "training_seconds": seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "versions": {**versions, "python": platform.python_version()},
+        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }
     write_json(run_dir / "result.json", result)
     print_table(result)

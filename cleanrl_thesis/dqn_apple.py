@@ -226,7 +226,7 @@ def complete_args(args: Args) -> Args:
 # The Apple game
 # ---------------------------------------------------------------------------------------------------------------------
 FPS, EPISODE_FRAMES = 60, 1_800  # an episode is 30 s
-SPEED = np.float32(0.00825)  # sides of the plane, per frame and axis; made by benchmark/apple_players.py
+SPEED = np.float32(0.00825)  # sides of the plane, per frame and axis; chosen by hand, see benchmark/apple_players.py
 REACH = np.float32(0.06)  # distance at which an apple is taken, in sides of the plane
 LIFETIME = 90  # frames until an apple that nobody takes is gone
 MOVES = np.array([(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)], np.float32).T  # (2, 9); action 4 stays
@@ -999,11 +999,12 @@ def check_video(env_id: str) -> None:
 def record_video(policy, args: Args, run_dir: Path) -> None:
     """Play the first evaluation episode once more and write it into `videos/`."""
     env = gym.wrappers.RecordVideo(make_env(args.env_id, "rgb_array"), str(run_dir / "videos"), lambda episode: True)
-    episode, ended = Episode(env, args.seed, EVALUATION_STREAM, args.frame_skip), False
+    episode = Episode(env, args.seed, EVALUATION_STREAM, args.frame_skip)
     obs = episode.start()
-    while not ended:
+    for _ in range(MAX_EVALUATION_STEPS):
         obs, _, terminated, truncated = episode.step(int(policy(obs[None])[0]))
-        ended = terminated or truncated
+        if terminated or truncated:
+            break
     env.close()
 
 
@@ -1027,11 +1028,7 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 
 
 def save_demonstrations(agent: QNetwork, args: Args, run_dir: Path) -> None:
-    """Write `--save-demos` episodes as `demos/episode_*.npz`, and a manifest with their checksums.
-
-    Each file has observations (T + 1, ...), actions (T,), rewards (T,), terminated, truncated, seed, and t_ns (T,), the
-    time of each action in nanoseconds, simulated where the environment says how many frames a second has.
-    """
+    """Write `--save-demos` episodes of the greedy policy into `demos/`."""
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
     episodes = play(numpy_greedy(agent), args.env_id, seeds, args.frame_skip, keep=True)
     write_demonstrations(
@@ -1040,7 +1037,11 @@ def save_demonstrations(agent: QNetwork, args: Args, run_dir: Path) -> None:
 
 
 def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
-    """Write episodes in the format of `save_demonstrations`; `about` goes into the manifest."""
+    """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
+
+    Each file has observations (T + 1, ...), actions (T,), rewards (T,), terminated, truncated, seed, and t_ns (T,), the
+    time of each action in nanoseconds, simulated where the environment says how many frames a second has.
+    """
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))
     manifest = {"version": 1, **about, "files": {}}
@@ -1153,7 +1154,6 @@ def main(args: Args) -> int:
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
     write_json(run_dir / "args.json", arguments(args))
-    (run_dir / "result.json").unlink(missing_ok=True)
     print(run_dir)
 
     random.seed(args.seed)  # this file draws from neither; for environments that do
@@ -1174,7 +1174,8 @@ def main(args: Args) -> int:
     between = max(args.checkpoint_interval, frames_per_step) + args.n_step * args.num_envs  # two checkpoints, at most
     spare = 2 * min(between, args.num_iterations * args.num_envs)
     added = 0 if checkpoint is None else checkpoint["added"]
-    buffer = ReplayBuffer(run_dir / "replay.dat", args.buffer_size, spare, obs_dim, added)
+    is_trained = checkpoint is not None and checkpoint["iteration"] >= last_iteration  # only its end is done again
+    buffer = None if is_trained else ReplayBuffer(run_dir / "replay.dat", args.buffer_size, spare, obs_dim, added)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
     means = Means()
     iteration, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}
@@ -1198,6 +1199,7 @@ def main(args: Args) -> int:
     global_step = iteration * frames_per_step
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
+    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
@@ -1295,6 +1297,7 @@ def finish_run(agent: QNetwork, args: Args, run_dir: Path, global_step: int, sec
         "steps_per_second": global_step / seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "versions": {**versions, "python": platform.python_version()},
+        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }
     write_json(run_dir / "result.json", result)
     print_table(result)

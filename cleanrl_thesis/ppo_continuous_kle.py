@@ -1508,7 +1508,6 @@ def main(args: Args) -> int:
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
     write_json(run_dir / "args.json", arguments(args))
-    (run_dir / "result.json").unlink(missing_ok=True)
     print(run_dir)
 
     random.seed(args.seed)  # this file draws from neither; for environments that do
@@ -1542,6 +1541,7 @@ def main(args: Args) -> int:
     global_step = iteration * args.batch_size
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
+    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
@@ -1626,6 +1626,7 @@ def finish_run(agent: Agent, args: Args, run_dir: Path, global_step: int, second
         "steps_per_second": global_step / seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "versions": {**versions, "python": platform.python_version()},
+        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }
     write_json(run_dir / "result.json", result)
     print_table(result)
