@@ -3,14 +3,13 @@
 # nearer to the DQN ("quick"); the runs behind benchmark/results/apple/.
 # Can be sent again after every stop. Two runs at a time: about 3 hours on 2 cores.
 #   benchmark/apple_alpha.sh
-#   SEEDS="1" WORKERS=1 benchmark/apple_alpha.sh
+#   SEEDS="1" FEWER_SEEDS="1" WORKERS=1 benchmark/apple_alpha.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
-SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
+SEEDS=${SEEDS:-1 2 3 4 5} FEWER_SEEDS=${FEWER_SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
 ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
 OTHER_ALPHAS=${OTHER_ALPHAS:-0.93 1.0 0.5 0.7 0.8 0.3 0.9}
 mkdir -p "$RUNS"
-git rev-parse --short HEAD >> "$RUNS/commits.txt"
 for seed in $SEEDS; do
   echo "--seed $seed --run-dir $RUNS/teacher_seed$seed"
 done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/dqn_apple.py --compile --save-model --resume
@@ -37,7 +36,7 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
     for alpha in 0.5 0.93 1.0; do student "$seed" "$alpha" "own_alpha$alpha" --states own; done
     for alpha in 0.0 0.93; do student "$seed" "$alpha" "episode_alpha$alpha" --split episode; done
   done
-  for seed in $SEEDS; do
+  for seed in $FEWER_SEEDS; do
     for temperature in 0 0.1 1 2; do
       for alpha in $OTHER_ALPHAS; do
         student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"
