@@ -52,9 +52,12 @@ def published_table() -> dict[str, dict[str, str]]:
         return {row["agent"]: row for row in csv.DictReader(file)}
 
 
+def git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout
+
+
 def commit() -> str:
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout.strip()
+    return git("describe", "--always", "--dirty").strip()
 
 
 def shortest_path(method):
@@ -113,7 +116,7 @@ def neighbours(method, args: Args):
             else:
                 fast = (slow + fast) / 2
         yield measure(method, "shortest path", args)
-        for method.SyntheticHuman.reaction in (12.0, 15.0, 18.0, 21.0):
+        for method.SyntheticHuman.reaction in (12.0, 15.0, 17.0, 20.0):
             yield measure(method, "synthetic human", args)
     method.SPEED, method.REACH, method.LIFETIME, method.SyntheticHuman.reaction = constants
 

@@ -7,6 +7,7 @@ the seeds' means; each mean is over 400 episodes.
 """
 
 import csv
+import hashlib
 import itertools
 import json
 import re
@@ -21,11 +22,17 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
-from apple_players import QUICK, ROOT, commit, load_method, published_table, shortest_path
+from apple_players import QUICK, ROOT, commit, git, load_method, published_table, shortest_path
 from matplotlib.figure import Figure
 from scipy import stats
 
 FPS = CLIP = 60  # a clip is 1 s
+ACTS = {  # the students' evaluations
+    "sampled": "sampled",
+    "greedy": "greedy",
+    "last_sampled": "sampled, last epoch",
+    "last_greedy": "greedy, last epoch",
+}
 
 
 @dataclass
@@ -46,7 +53,8 @@ def read_runs(folder: Path) -> list[dict]:
         kind = re.sub(r"_seed\d+$", "", path.parent.name)
         if not result["complete"]:
             continue
-        evaluations = result["evaluation"] if "sampled" in result["evaluation"] else {"greedy": result["evaluation"]}
+        is_student = "sampled" in result["evaluation"]
+        evaluations = result["evaluation"] if is_student else {"greedy": result["evaluation"]}
         for mode, numbers in evaluations.items():
             rows.append(
                 {
@@ -56,10 +64,12 @@ def read_runs(folder: Path) -> list[dict]:
                     "temperature": args.get("temperature", ""),
                     "mode": mode,
                     **{name: round(numbers[name], 3) for name in ("mean", "std", "min", "max")},
+                    "kept_epoch": result["test"]["epoch"] if is_student else "",
                     "test_accuracy_rl": round(result.get("test", {}).get("accuracy_rl") or np.nan, 4),
                     "test_accuracy_human": round(result.get("test", {}).get("accuracy_human", np.nan), 4),
                     "steps": result["global_step"],
                     "training_seconds": round(result["training_seconds"]),
+                    "script_sha256": result.get("script_sha256", "not recorded")[:12],
                 }
             )
     return rows
@@ -78,6 +88,8 @@ def interval(values: list[float]) -> tuple[float, float]:
 
 def with_interval(values: list[float], digits: int = 2) -> str:
     mean, half = interval(values)
+    if np.isnan(mean):
+        return ""
     return f"{mean:.{digits}f}" + ("" if np.isnan(half) else f" ± {half:.{digits}f}")
 
 
@@ -97,13 +109,15 @@ def table_2_1(rows: list[dict], human: list[dict], shortest: list[dict]) -> str:
         "| agent | | seeds | max, mean over seeds | min, mean over seeds | avg | std |",
         "|---|---|---|---|---|---|---|",
     ]
+    students = {"BC, α = 0": "alpha0.0", "hybrid, α = 0.93": "alpha0.93", "distilled DQN, α = 1": "alpha1.0"}
     measured = {
         "shortest path": [("scripted", shortest)],
         "human": [("synthetic", human)],
         "DQN": [("greedy", select(rows, "teacher", "greedy"))],
-        "BC, α = 0": [(mode, select(rows, "alpha0.0", mode)) for mode in ("sampled", "greedy")],
-        "hybrid, α = 0.93": [(mode, select(rows, "alpha0.93", mode)) for mode in ("sampled", "greedy")],
-        "distilled DQN, α = 1": [(mode, select(rows, "alpha1.0", mode)) for mode in ("sampled", "greedy")],
+        **{
+            name: [(mode, select(rows, kind, mode)) for mode in ("sampled", "greedy")]
+            for name, kind in students.items()
+        },
     }
     published = published_table()
     for agent, groups in measured.items():
@@ -145,13 +159,20 @@ def representative_alpha(curve: dict[float, dict[int, float]], human: float) -> 
     return min(better) if better else None
 
 
+def cell(scores: dict[int, float], most: int) -> str:
+    """Mean and interval, and the number of seeds where it is not all of them."""
+    number = "" if len(scores) == most else f" ({len(scores)})"
+    return with_interval(list(scores.values()), 1) + number if scores else ""
+
+
 def alpha_table(rows: list[dict], mode: str) -> str:
-    """Fig. 2.4 in numbers: score for each α and temperature."""
+    """Fig. 2.4 in numbers: score for each α and temperature; in brackets the number of seeds where it is not all."""
     columns = {f"T = {temperature}": alpha_curve(rows, mode, temperature) for temperature in temperatures(rows)}
     alphas = sorted({alpha for curve in columns.values() for alpha in curve})
-    lines = [f"| α, {mode} | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
+    most = max(len(scores) for curve in columns.values() for scores in curve.values())
+    lines = [f"| α, {ACTS[mode]} | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
     for alpha in alphas:
-        cells = [with_interval(list(curve[alpha].values()), 1) if alpha in curve else "" for curve in columns.values()]
+        cells = [cell(curve.get(alpha, {}), most) for curve in columns.values()]
         lines.append(f"| {alpha} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
@@ -159,25 +180,37 @@ def alpha_table(rows: list[dict], mode: str) -> str:
 def paired_difference(first: dict[int, float], second: dict[int, float]) -> str:
     """Difference of the scores of the seeds that both have, with its interval."""
     difference, half = interval([first[seed] - second[seed] for seed in first.keys() & second.keys()])
-    return f"{difference:+.1f}" + ("" if np.isnan(half) else f" ± {half:.1f}")
+    return "" if np.isnan(difference) else f"{difference:+.1f}" + ("" if np.isnan(half) else f" ± {half:.1f}")
 
 
 def shape_table(rows: list[dict], humans: dict[str, float]) -> str:
-    """Dip and rise of each curve of Fig. 2.4, and the α of the thesis' rule."""
-    header = "| human | T | act | α = 0 | lowest, at α | lowest − (α = 0) | (α = 1) − lowest | rule picks α |"
-    lines = [header, "|" + "---|" * 8]
-    for (group, human), mode in itertools.product(humans.items(), ("sampled", "greedy")):
+    """The thesis' dip (α = 0.7 below α = 0) and rise (from 0.7 to 1) in each curve, and the α that its rule picks."""
+    header = "| synthetic human | T | student | α = 0 | α = 0.7 | α = 1 | 0.7 less 0 | 1 less 0.7 | rule picks α |"
+    lines = [header, "|" + "---|" * 9]
+    for (group, human), mode in itertools.product(humans.items(), ACTS):
         for temperature in temperatures(rows, group):
             curve = alpha_curve(rows, mode, temperature, group)
-            inner = {alpha: mean_score(scores) for alpha, scores in curve.items() if 0 < alpha < 1}
-            if not inner or not {0.0, 1.0} <= curve.keys():
+            if not {0.0, 0.7, 1.0} <= curve.keys():
                 continue
-            low = min(inner, key=inner.get)
-            changes = paired_difference(curve[low], curve[0.0]), paired_difference(curve[1.0], curve[low])
-            name = f"{group.strip('_') or 'as published'}, {human:.1f}"
-            lowest = f"{inner[low]:.1f}, {low}"
-            cells = (name, temperature, mode, f"{mean_score(curve[0.0]):.1f}", lowest, *changes)
-            lines.append(f"| {' | '.join(map(str, cells))} | {representative_alpha(curve, human)} |")
+            values = [f"{mean_score(curve[alpha]):.1f}" for alpha in (0.0, 0.7, 1.0)]
+            changes = paired_difference(curve[0.7], curve[0.0]), paired_difference(curve[1.0], curve[0.7])
+            who = f"{group.strip('_') or 'calibrated'}, {human:.1f}"
+            cells = (who, temperature, ACTS[mode], *values, *changes, representative_alpha(curve, human))
+            lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"
+
+
+def kept_table(rows: list[dict]) -> str:
+    """Which epoch the rule of the best test accuracy keeps, and what that costs against the last epoch."""
+    lines = ["| α, T = 0.01 | kept epochs | sampled, kept less last | greedy, kept less last |", "|---|---|---|---|"]
+    curves = {mode: alpha_curve(rows, mode) for mode in ACTS}
+    for alpha in curves["sampled"]:
+        kept = [row for row in select(rows, f"alpha{alpha}", "sampled")]
+        epochs = ", ".join(str(row["kept_epoch"]) for row in kept)
+        costs = [
+            paired_difference(curves[mode][alpha], curves[f"last_{mode}"][alpha]) for mode in ("sampled", "greedy")
+        ]
+        lines.append(f"| {alpha} | {epochs} | {' | '.join(costs)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -196,34 +229,36 @@ def ablation_table(rows: list[dict]) -> str:
 
 
 def figure_2_4(rows: list[dict], humans: dict[str, float]) -> Figure:
-    """Score over α: one row of panels for each human, one column for each way to act, one line for each temperature."""
-    figure = Figure(figsize=(11, 1 + 3.6 * len(humans)), layout="constrained")
+    """Score over α: a row of panels for each human and kept network, a column for each way to act, a line for each T."""
+    panels = [("", ""), ("", "last_"), *([("quick_", "last_")] if "quick_" in humans else [])]
+    figure = Figure(figsize=(11, 1 + 3.2 * len(panels)), layout="constrained")
     teacher, _ = interval([row["mean"] for row in select(rows, "teacher", "greedy")])
     published = published_table()
     stars = {0.0: float(published["BC, α = 0"]["avg"]), 0.93: float(published["hybrid, α = 0.93"]["avg"])}
-    colours = {temperature: f"C{i}" for i, temperature in enumerate(temperatures(rows))}
-    grid = figure.subplots(len(humans), 2, sharex=True, sharey=True, squeeze=False)
-    for panels, (group, human) in zip(grid, humans.items()):
-        for axes, mode in zip(panels, ("sampled", "greedy")):
+    every = sorted({temperature for group in humans for temperature in temperatures(rows, group)})
+    colours = {temperature: f"C{i}" for i, temperature in enumerate(every)}
+    grid = figure.subplots(len(panels), 2, sharex=True, sharey=True, squeeze=False)
+    for row, (group, network) in zip(grid, panels):
+        for axes, mode in zip(row, ("sampled", "greedy")):
             for temperature in temperatures(rows, group):
-                curve = alpha_curve(rows, mode, temperature, group)
+                curve = alpha_curve(rows, network + mode, temperature, group)
                 means, halves = np.array([interval(list(scores.values())) for scores in curve.values()]).T
                 colour = colours[temperature]
                 axes.plot(list(curve), means, "o-", color=colour, markersize=3.5, label=f"T = {temperature}")
                 low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
                 axes.fill_between(list(curve), low, high, color=colour, alpha=0.15, linewidth=0)
             axes.axhline(teacher, color="black", linestyle="--", linewidth=1, label="DQN")
-            axes.axhline(human, color="black", linestyle=":", linewidth=1, label="this row's human")
+            axes.axhline(humans[group], color="black", linestyle=":", linewidth=1, label="synthetic human")
             if not group:
                 axes.plot(list(stars), list(stars.values()), "k*", markersize=9, label="published (Table 2.1)")
-            who = f"{group.strip('_')} synthetic human" if group else "synthetic human"
-            axes.set(title=f"{who}, student {mode}", ylim=(0, None))
+            who = f"{group.strip('_')} human, {ACTS[network + mode]}".strip()
+            axes.set(title=who if group else ACTS[network + mode], ylim=(0, None))
             axes.spines[["top", "right"]].set_visible(False)
-        panels[0].set_ylabel("apples in 30 s, mean of 400 episodes")
+        row[0].set_ylabel("apples in 30 s")
     for axes in grid[-1]:
         axes.set_xlabel("α, weight of the DQN")
     figure.legend(*grid[0, 1].get_legend_handles_labels(), fontsize="small", loc="outside right center")
-    figure.suptitle("Fig. 2.4: score over α; bands are 95% intervals over seeds")
+    figure.suptitle("Fig. 2.4: mean score of 400 episodes over α; bands are 95% intervals over seeds")
     return figure
 
 
@@ -238,12 +273,15 @@ def load_student(method, folder: Path):
     return student
 
 
+HUMAN = "synthetic human"
+
+
 def agents_of(method, folder: Path, seed: int, episodes: int) -> dict[str, list[dict]]:
     """Episodes of each agent of a seed that is there; the second human is as good as an agent can look."""
     seeds = [method.episode_seed(seed, method.DEMONSTRATION_STREAM, i) for i in range(episodes)]
     policies = {
-        "human": method.SyntheticHuman(episodes, seed),
-        "human again": method.SyntheticHuman(episodes, seed + 1000),
+        HUMAN: method.SyntheticHuman(episodes, seed),
+        f"{HUMAN} again": method.SyntheticHuman(episodes, seed + 1000),
     }
     if (folder / f"teacher_seed{seed}" / "result.json").exists():
         teacher = method.load_teacher(folder / f"teacher_seed{seed}", "AppleGame-v0")
@@ -316,6 +354,10 @@ def reaction_times(episodes: list[dict], moves: np.ndarray) -> list[int]:
     return times
 
 
+def median(values: list[int]) -> float:
+    return float(np.median(values)) if values else np.nan
+
+
 def direction_changes_per_second(episodes: list[dict]) -> float:
     """How often the avatar moves on in another direction; standing still between does not count."""
     changes = 0
@@ -331,13 +373,13 @@ def likeness_table(method, folder: Path, seeds: list[int], episodes: int) -> str
     for seed in seeds:
         agents = agents_of(method, folder, seed, episodes)
         for name, played in agents.items():
-            if name != "human":
-                measures[name]["auc"].append(tell_apart(agents["human"], played, seed))
+            if name != HUMAN:
+                measures[name]["auc"].append(tell_apart(agents[HUMAN], played, seed))
             measures[name]["score"].append(float(np.mean([episode["rewards"].sum() for episode in played])))
-            measures[name]["reaction"].append(float(np.median(reaction_times(played, method.MOVES))) / FPS * 1000)
+            measures[name]["reaction"].append(median(reaction_times(played, method.MOVES)) / FPS * 1000)
             measures[name]["changes"].append(direction_changes_per_second(played))
     lines = [
-        "| agent | seeds | told from the human, AUC | reaction, ms (median) | direction changes per s | score |",
+        "| agent | seeds | told from the synthetic human, AUC | reaction, ms (median) | direction changes per s | score |",
         "|---|---|---|---|---|---|",
     ]
     for name, values in measures.items():
@@ -354,16 +396,26 @@ def write_csv(path: Path, rows: list[dict]) -> None:
         writer.writerows(rows)
 
 
-def provenance(runs: Path, rows: list[dict], seeds: list[int]) -> str:
+def commit_of(script: str, digest: str) -> str:
+    """The newest commit whose script has this checksum."""
+    path = f"cleanrl_thesis/{script}.py"
+    commits = git("log", "--format=%h", "--", path).split()
+    found = (c for c in commits if hashlib.sha256(git("show", f"{c}:{path}").encode()).hexdigest().startswith(digest))
+    return next(found, "not recorded")
+
+
+def provenance(rows: list[dict], seeds: list[int]) -> str:
     """What the results rest on."""
     count = len({(row["kind"], row["seed"]) for row in rows})
     hours = sum(row["training_seconds"] for row in rows if row["mode"] == "greedy") / 3600
-    commits = runs / "commits.txt"
-    made_at = ", ".join(dict.fromkeys(commits.read_text().split())) if commits.exists() else "not recorded"
+    scripts = {"dqn_apple": "teacher", "distill_hybrid": "alpha"}
+    digests = {s: {row["script_sha256"] for row in rows if part in row["kind"]} for s, part in scripts.items()}
+    made_at = [f"{s}.py at {', '.join(sorted(commit_of(s, d) for d in digests[s]))}" for s in scripts]
     return (
-        f"`benchmark/apple_alpha.sh`, commit of the runs: {made_at}; of this report: {commit()}. {count} runs, "
+        f"`benchmark/apple_alpha.sh`, commits: {'; '.join(made_at)}; this report at {commit()}. {count} runs, "
         f"{hours:.1f} core-hours of training, seeds {', '.join(map(str, seeds))}; each mean is over 400 episodes, each ± "
-        "is a 95% t-interval over seeds.\n\n"
+        "is a 95% t-interval over seeds. A student is of the epoch with the best test accuracy where no other is named."
+        "\n\n"
     )
 
 
@@ -385,12 +437,13 @@ def main(args: Args) -> None:
     write_csv(args.out / "runs.csv", rows)
     sections = {
         "Table 2.1": table_2_1(rows, human, shortest),
-        "Fig. 2.4": alpha_table(rows, "sampled") + "\n" + alpha_table(rows, "greedy"),
+        "Fig. 2.4": "\n".join(alpha_table(rows, mode) for mode in ACTS),
         "Dip, rise and rule": shape_table(rows, humans),
+        "Which network is kept": kept_table(rows),
         "States and split": ablation_table(rows),
         "Human-likeness without people": likeness_table(method, args.runs, seeds, args.likeness_episodes),
     }
-    text = provenance(args.runs, rows, seeds) + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
+    text = provenance(rows, seeds) + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
     (args.out / "table.md").write_text(text)
     figure_2_4(rows, humans).savefig(args.out / "fig_2_4.png", dpi=130)
     print(text)

@@ -294,8 +294,8 @@ class AppleGames:
         image = PIL.Image.new("RGB", (fine, fine + 2 * bar), (238, 243, 232))
         pen = PIL.ImageDraw.Draw(image)
         left = 1 - self.frames[game] / EPISODE_FRAMES
-        pen.rectangle((0, 0, fine, 2 * bar), fill=(40, 48, 56))
-        pen.rectangle((0, 2 * bar - 12, fine * left, 2 * bar), fill=(240, 180, 60))
+        pen.rectangle((0, 0, fine, 2 * bar - 1), fill=(40, 48, 56))
+        pen.rectangle((0, 2 * bar - 12, fine * left, 2 * bar - 1), fill=(240, 180, 60))
         font = PIL.ImageFont.load_default(1.1 * bar)
         pen.text((0.4 * bar, 0.9 * bar), f"apples {self.scores[game]}", (255, 255, 255), font, "lm")
         pen.text((fine - 0.4 * bar, 0.9 * bar), f"{left * EPISODE_FRAMES / FPS:.1f} s", (255, 255, 255), font, "rm")

@@ -18,6 +18,7 @@ SMALL = [
     *("--update-epochs", "2", "--checkpoint-interval", "1", "--eval-episodes", "2"),
 ]
 torch.set_num_threads(1)
+needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 
 
 def command(*flags: object, script: Path = SCRIPT) -> list[str]:

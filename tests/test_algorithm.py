@@ -3,12 +3,12 @@
 import dataclasses
 import functools
 import math
-import shutil
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from conftest import needs_compiler
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.running_mean_std import RunningMeanStd as SB3RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -275,9 +275,6 @@ def test_flat_optimizer_is_torch_adam(max_grad_norm):
     for name, value in ours.items():
         torch.testing.assert_close(value, reference[name], rtol=1e-3, atol=2e-5)
         assert (value - start.get_parameter(name)).abs().max() > 5e-4, f"{name} did not move: this would show nothing"
-
-
-needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 
 
 @needs_compiler

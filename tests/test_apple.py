@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import torch
+from conftest import needs_compiler
 from gymnasium.utils.env_checker import check_env
 
 from cleanrl_thesis import dqn_apple as dqn
@@ -160,9 +161,14 @@ def test_the_picture_shows_avatar_apple_score_and_time():
 
     assert np.allclose(middle(red), (0.25, 0.75), atol=0.03)
     assert np.allclose(middle(blue), (0.75, 0.25), atol=0.03)
-    for _ in range(900):
-        env.step(STAY)
-    assert not np.array_equal(picture[:48], env.render()[:48])
+    games.scores[0] = 7
+    scored = env.render()
+    assert not np.array_equal(picture[:40, :240], scored[:40, :240]) and np.array_equal(
+        picture[:, 240:], scored[:, 240:]
+    )
+    games.frames[0] += 900
+    later = env.render()
+    assert not np.array_equal(later[:48, 240:], scored[:48, 240:]) and np.array_equal(later[48:], scored[48:])
 
 
 # The algorithm
@@ -254,6 +260,7 @@ def test_update_is_torchs_adam_on_the_loss(double):
     assert torch.equal(optimizer.target, torch.cat([p.detach().reshape(-1) for p in target.parameters()]))
 
 
+@needs_compiler
 def test_compiled_update_is_the_plain_one():
     plain, compiled = make_update(), make_update(compile=True)
     assert isinstance(compiled[3], dqn.CompiledUpdate)

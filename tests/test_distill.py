@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
+from conftest import ROOT, needs_compiler
 
 from cleanrl_thesis import distill_hybrid as distill
 
@@ -112,9 +112,10 @@ def test_update_is_torchs_adam_on_the_loss(states):
         assert torch.allclose(layer.weight, source.weight, atol=2e-6)
 
 
+@needs_compiler
 def test_compiled_update_is_the_plain_one():
     (_, plain, data, _), (_, compiled, _, _) = make_update(), make_update(compile=True)
-    assert compiled.step is not compiled.plain_step
+    assert compiled.is_compiled and not plain.is_compiled
     for _ in range(20):
         masks = distill.draw_masks((2, 64, 32), 0.5)
         parts = [torch.stack(update(data, masks)) for update in (plain, compiled)]
@@ -188,6 +189,40 @@ def test_recorded_images_must_be_bytes(tmp_path, monkeypatch):
     distill.write_demonstrations(tmp_path, episodes, {"env_id": "Quadrants-v0", "player": "a", "mode": "b"})
     with pytest.raises(distill.UsageError, match="must be uint8, they are float64"):
         distill.read_demonstrations(tmp_path, "Quadrants-v0")
+
+
+@pytest.mark.parametrize("states", ["human", "own"])
+def test_frames_are_labelled_by_the_teacher_where_the_term_asks(states):
+    """Over the human's states both terms see the same frames; over its own the DQN's are those of its play."""
+    args = distill.Args(teacher="a teacher", states=states, temperature=0.5, demo_frames=1_000)
+    torch.manual_seed(0)
+    teacher = distill.QNetwork(6, 9, 16, True)
+    human = distill.join_frames(distill.make_human_demonstrations(args), 1_000)
+    data = distill.label_frames(human, teacher, args)
+    assert torch.equal(data.he_obs, torch.from_numpy(human.obs)) and data.he_actions.tolist() == human.actions.tolist()
+    with torch.no_grad():
+        assert torch.allclose(data.rl_labels, torch.softmax(teacher(data.rl_obs) / 0.5, 1))
+    assert torch.equal(data.rl_obs, data.he_obs) == (states == "human")
+    if states == "own":
+        seed = distill.episode_seed(args.seed, distill.DEMONSTRATION_STREAM, 0)
+        env = distill.make_env("AppleGame-v0")
+        obs, _ = env.reset(seed=seed)
+        for row in data.rl_obs:
+            assert np.array_equal(row, obs)
+            obs = env.step(int(teacher(row[None]).argmax()))[0]
+
+
+def test_agreement_and_loss_on_test_frames_by_hand():
+    student, update, data, args = make_update()
+    numbers = distill.measure(student, data, args)
+    agrees_rl = agrees_human = 0
+    with torch.no_grad():
+        for i in range(64):
+            agrees_rl += int(student(data.rl_obs[i : i + 1]).argmax()) == int(data.rl_labels[i].argmax())
+            agrees_human += int(student(data.he_obs[i : i + 1]).argmax()) == int(data.he_actions[i])
+    assert numbers["test/accuracy_human"] == pytest.approx(agrees_human / 64)
+    expected = (args.alpha * agrees_rl + (1 - args.alpha) * agrees_human) / 64
+    assert numbers["test/accuracy"] == pytest.approx(expected)
 
 
 # The synthetic human
