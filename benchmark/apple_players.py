@@ -5,7 +5,9 @@
     python benchmark/apple_players.py --demos DIR --seed 1  # demonstrations of a human who is nearer to the DQN
 
 The game is fixed by two published rows that have to fit at once: the shortest-path player near the DQN's, 36.27 ± 5.44
-with at most 53, and a person's near 18.71 ± 2.86. Writes `benchmark/results/apple/players.csv` and `.md`.
+with at most 53, and a person's near 18.71 ± 2.86. Apples live for 90 frames because the human then needs a reaction time
+of 17 frames, 0.28 s, as people have; with 60 frames it would be 0.2 s, with 120 above 0.35 s. Both players' deviations
+are not fitted. Writes `benchmark/results/apple/players.csv` and `.md`.
 """
 
 import csv
