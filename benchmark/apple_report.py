@@ -241,16 +241,19 @@ def figure_2_4(rows: list[dict], humans: dict[str, float]) -> Figure:
     stars = {0.0: float(published["BC, α = 0"]["avg"]), 0.93: float(published["hybrid, α = 0.93"]["avg"])}
     every = sorted({temperature for group in humans for temperature in temperatures(rows, group)})
     colours = {temperature: f"C{i}" for i, temperature in enumerate(every)}
+    most = len({row["seed"] for row in rows})
     grid = figure.subplots(len(panels), 2, sharex=True, sharey=True, squeeze=False)
     for row, (group, network) in zip(grid, panels):
         for axes, mode in zip(row, ("sampled", "greedy")):
             for temperature in temperatures(rows, group):
                 curve = alpha_curve(rows, network + mode, temperature, group)
                 means, halves = np.array([interval(list(scores.values())) for scores in curve.values()]).T
-                colour = colours[temperature]
-                axes.plot(list(curve), means, "o-", color=colour, markersize=3.5, label=f"T = {temperature}")
-                low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
-                axes.fill_between(list(curve), low, high, color=colour, alpha=0.15, linewidth=0)
+                has_all = all(len(scores) == most for scores in curve.values())
+                style = {"color": colours[temperature], "linestyle": "-" if has_all else "--", "linewidth": 1 + has_all}
+                axes.plot(list(curve), means, marker="o", markersize=3.5, label=f"T = {temperature}", **style)
+                if has_all:
+                    low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
+                    axes.fill_between(list(curve), low, high, color=colours[temperature], alpha=0.15, linewidth=0)
             axes.axhline(teacher, color="black", linestyle="--", linewidth=1, label="DQN")
             axes.axhline(humans[group], color="black", linestyle=":", linewidth=1, label="synthetic human")
             if not group:
@@ -262,7 +265,9 @@ def figure_2_4(rows: list[dict], humans: dict[str, float]) -> Figure:
     for axes in grid[-1]:
         axes.set_xlabel("α, weight of the DQN")
     figure.legend(*grid[0, 1].get_legend_handles_labels(), fontsize="small", loc="outside right center")
-    figure.suptitle("Fig. 2.4: mean score of 400 episodes over α; bands are 95% intervals over seeds")
+    figure.suptitle(
+        f"Fig. 2.4: mean score of 400 episodes over α; bands are 95% intervals of {most} seeds, thin lines have fewer"
+    )
     return figure
 
 
