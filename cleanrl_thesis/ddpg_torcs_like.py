@@ -1418,38 +1418,35 @@ MAX_EVALUATION_STEPS = 100_000  # of an episode, where the environment has no ti
 WINDOW = 5 * FPS  # steps in a window of the driving score, 5 s
 
 
-def make_games(env_id: str, num_envs: int, options: dict) -> gym.vector.VectorEnv:
-    """Environments side by side: the driving task's own vectorised one, else copies stepped in turn."""
-    if is_driving(env_id):
-        return TorcsLikeVectorEnv(num_envs, **options)
+def make_games(args: Args, num_envs: int) -> gym.vector.VectorEnv:
+    """Environments side by side: the driving task's own, scored by distance whatever the reward, or copies in turn."""
+    if is_driving(args.env_id):
+        return TorcsLikeVectorEnv(num_envs, track=args.track_name, brake=args.brake)
     same_step = gym.vector.AutoresetMode.SAME_STEP
-    return gym.vector.SyncVectorEnv([lambda: make_env(env_id)] * num_envs, autoreset_mode=same_step)
+    return gym.vector.SyncVectorEnv([lambda: make_env(args.env_id)] * num_envs, autoreset_mode=same_step)
 
 
-def play(policy, env_id: str, options: dict, seeds: list[int], keep: bool = False) -> list[dict[str, np.ndarray]]:
+def play(policy, games: gym.vector.VectorEnv, seeds: list[int], keep: bool = False) -> list[dict[str, np.ndarray]]:
     """One episode for each seed, side by side, by a function from observations (N, O) to actions (N, A).
 
     Returns for each `rewards` (T,), `terminated`, `truncated` and `seed`; with `keep` also `observations` (T + 1, O) and
-    `actions` (T, A); of the driving task also `progress` (T,) in m and `crashed` (T,).
+    `actions` (T, A).
     """
-    games = make_games(env_id, len(seeds), options)
     obs, _ = games.reset(seed=seeds)
     running, lengths = np.ones(len(seeds), bool), np.zeros(len(seeds), int)
     terminated, truncated = np.zeros(len(seeds), bool), np.zeros(len(seeds), bool)
-    columns = {"rewards": [], "progress": [], "crashed": []} | ({"observations": [obs], "actions": []} if keep else {})
+    observations, actions, rewards = [obs], [], []
     while running.any():
         action = policy(obs)
         obs, reward, ends, time_outs, infos = games.step(action)
-        time_outs = time_outs | (lengths.max() + 1 == MAX_EVALUATION_STEPS)
-        columns["rewards"].append(reward)
-        for name in ("progress", "crashed"):
-            columns[name].append(infos.get(name, np.zeros(len(seeds))))
+        time_outs = time_outs | (len(rewards) + 1 == MAX_EVALUATION_STEPS)
+        rewards.append(reward)
         if keep:
             after = obs.copy()
             for i in np.flatnonzero(infos.get("_final_obs", [])):
                 after[i] = infos["final_obs"][i]
-            columns["observations"].append(after)
-            columns["actions"].append(action)
+            observations.append(after)
+            actions.append(action)
         lengths += running
         terminated |= running & ends
         truncated |= running & time_outs
@@ -1457,33 +1454,30 @@ def play(policy, env_id: str, options: dict, seeds: list[int], keep: bool = Fals
     games.close()
     episodes = []
     for i, length in enumerate(lengths):
-        ends_at = {name: length + (name == "observations") for name in columns}
-        episode = {name: np.array([row[i] for row in rows[: ends_at[name]]]) for name, rows in columns.items()}
-        episodes.append(episode | {"terminated": terminated[i], "truncated": truncated[i], "seed": np.array(seeds[i])})
+        episode = {"rewards": np.array([reward[i] for reward in rewards[:length]], np.float64)}
+        episode |= {"terminated": terminated[i], "truncated": truncated[i], "seed": np.array(seeds[i])}
+        if keep:
+            episode["observations"] = np.array([obs[i] for obs in observations[: length + 1]])
+            episode["actions"] = np.array([action[i] for action in actions[:length]])
+        episodes.append(episode)
     return episodes
 
 
-def window_scores(progress: np.ndarray, crashed: np.ndarray) -> list[float]:
+def window_scores(rewards: np.ndarray) -> list[float]:
     """Metres in each window of 5 s of an episode, 0 for that of a crash; a last one that is cut short is left out."""
-    scores = []
-    for start in range(0, len(progress), WINDOW):
-        window = slice(start, start + WINDOW)
-        if crashed[window].any():
-            scores.append(0.0)
-        elif len(progress[window]) == WINDOW:
-            scores.append(float(progress[window].sum()))
-    return scores
+    windows = [rewards[start : start + WINDOW] for start in range(0, len(rewards), WINDOW)]
+    scores = [0.0 if (window == -1).any() else float(window.sum()) for window in windows]
+    return scores if len(windows[-1]) == WINDOW or (windows[-1] == -1).any() else scores[:-1]
 
 
 def driving_scores(episodes: list[dict[str, np.ndarray]], length: float) -> dict:
-    """Table 2.3's score, in metres and in (km/h)·s, over the episodes' means; laps and crashes."""
-    scores = [window_scores(episode["progress"], episode["crashed"]) for episode in episodes]
-    means = [float(np.mean(windows)) for windows in scores if windows]
+    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s; crashes, and laps of each."""
+    means = [float(np.mean(scores)) for scores in (window_scores(e["rewards"]) for e in episodes) if scores]
     return {
         "metres_in_5_s": summary(means),
         "score": summary([mean * 3.6 for mean in means]),
-        "crashes": int(sum(episode["crashed"].any() for episode in episodes)),
-        "laps": [float(episode["progress"].sum() / length) for episode in episodes],
+        "crashes": int(sum((episode["rewards"] == -1).any() for episode in episodes)),
+        "laps": [float(episode["rewards"][episode["rewards"] != -1].sum() / length) for episode in episodes],
     }
 
 
@@ -1524,7 +1518,7 @@ def scaled(actions: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
 def evaluate(policy, args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes that training never saw; write `evaluation.json` and, if asked, a video."""
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
-    episodes = play(policy, args.env_id, env_options(args), seeds)
+    episodes = play(policy, make_games(args, len(seeds)), seeds)
     returns = [float(episode["rewards"].sum()) for episode in episodes]
     if args.capture_video:
         record_video(policy, args, run_dir, seeds[0])
@@ -1555,7 +1549,7 @@ def save_demonstrations(policy, args: Args, run_dir: Path) -> None:
     the time of each action in nanoseconds, simulated where the environment says how many frames a second has.
     """
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
-    episodes = play(policy, args.env_id, env_options(args), seeds, keep=True)
+    episodes = play(policy, make_games(args, len(seeds)), seeds, keep=True)
     about = {"env_id": args.env_id, "options": env_options(args), "player": args.exp_name, "mode": "without noise"}
     write_demonstrations(run_dir / "demos", episodes, about)
 
@@ -1567,8 +1561,7 @@ def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], ab
     manifest = {"version": 1, **about, "files": {}}
     for i, episode in enumerate(episodes):
         content = io.BytesIO()
-        arrays = {name: array for name, array in episode.items() if name not in ("progress", "crashed")}
-        np.savez(content, **arrays, t_ns=np.arange(len(episode["rewards"]), dtype=np.int64) * step_ns)
+        np.savez(content, **episode, t_ns=np.arange(len(episode["rewards"]), dtype=np.int64) * step_ns)
         write_whole(folder / f"episode_{i:05d}.npz", content.getvalue())
         manifest["files"][f"episode_{i:05d}.npz"] = hashlib.sha256(content.getvalue()).hexdigest()
     write_json(folder / "manifest.json", manifest)
