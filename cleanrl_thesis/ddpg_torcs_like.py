@@ -1191,7 +1191,7 @@ class Update:
         self.agent, self.optimizer, self.args = agent, optimizer, args
         self.obs_dim = agent.actor.first.in_features
         self.weights = [f"{name}.weight" for name in ("first", "second")]
-        self.step = self.plain_step
+        self.step, self.is_compiled = self.plain_step, False
         if args.compile:
             self.compile(example)
 
@@ -1207,7 +1207,7 @@ class Update:
             with torch.no_grad():  # compiles, and changes nothing but copies
                 compiled(*(tensor.clone() for tensor in self.optimizer.state_dict().values()), example)
             torch.compiler.set_stance("default", skip_guard_eval_unsafe=True)  # every call is alike
-            self.step = compiled
+            self.step, self.is_compiled = compiled, True
         except Exception as error:  # whatever the compiler's tool chain lacks, the plain step needs none of it
             print(f"--compile: failed ({first_line(error)}), goes on without", file=sys.stderr)
 
@@ -1497,10 +1497,10 @@ def record_video(policy, args: Args, run_dir: Path, seed: int) -> None:
     env = make_env(args.env_id, "rgb_array", **env_options(args))
     env = gym.wrappers.RecordVideo(env, str(run_dir / "videos"), lambda episode: True)
     obs, _ = env.reset(seed=seed)
-    ended = False
-    while not ended:
+    for _ in range(MAX_EVALUATION_STEPS):
         obs, _, terminated, truncated, _ = env.step(policy(obs[None])[0])
-        ended = terminated or truncated
+        if terminated or truncated:
+            break
     env.close()
 
 
@@ -1543,11 +1543,7 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 
 
 def save_demonstrations(policy, args: Args, run_dir: Path) -> None:
-    """Write `--save-demos` episodes as `demos/episode_*.npz`, and a manifest with their checksums.
-
-    Each file has observations (T + 1, ...), actions (T, ...), rewards (T,), terminated, truncated, seed, and t_ns (T,),
-    the time of each action in nanoseconds, simulated where the environment says how many frames a second has.
-    """
+    """Write `--save-demos` episodes of the actor without noise into `demos/`."""
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
     episodes = play(policy, make_games(args, len(seeds)), seeds, keep=True)
     about = {"env_id": args.env_id, "options": env_options(args), "player": args.exp_name, "mode": "without noise"}
@@ -1555,7 +1551,11 @@ def save_demonstrations(policy, args: Args, run_dir: Path) -> None:
 
 
 def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
-    """Write episodes in the format of `save_demonstrations`; `about` goes into the manifest."""
+    """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
+
+    Each file has observations (T + 1, O), actions (T, A), rewards (T,), terminated, truncated, seed, and t_ns (T,), the
+    time of each action in nanoseconds, simulated where the environment says how many frames a second has.
+    """
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))
     manifest = {"version": 1, **about, "files": {}}
@@ -1671,7 +1671,6 @@ def main(args: Args) -> int:
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
     write_json(run_dir / "args.json", arguments(args))
-    (run_dir / "result.json").unlink(missing_ok=True)
     print(run_dir)
 
     random.seed(args.seed)  # this file draws from neither; for environments that do
@@ -1692,7 +1691,8 @@ def main(args: Args) -> int:
     explorer = (ParameterNoise if args.noise == "parameter" else ActionNoise)(optimizer, args, action_dim, rng)
     spare = 2 * (min(max(args.checkpoint_interval, args.rollout_steps), args.total_timesteps) + args.rollout_steps)
     added, width = 0 if checkpoint is None else checkpoint["added"], 2 * obs_dim + action_dim + 2
-    buffer = ReplayBuffer(run_dir / "replay.dat", args.buffer_size, spare, width, added)
+    is_trained = checkpoint is not None and checkpoint["iteration"] >= last_iteration  # only its end is done again
+    buffer = None if is_trained else ReplayBuffer(run_dir / "replay.dat", args.buffer_size, spare, width, added)
     means = Means()
     iteration, updates, training_seconds, offsets = 0, 0, 0.0, {"episodes": 0, "updates": 0}
     distance = math.nan
@@ -1710,12 +1710,13 @@ def main(args: Args) -> int:
         if not players.load_state_dict(checkpoint["players"]):
             print("--resume: the replayed episode differs (another machine?), goes on with it", file=sys.stderr)
     update = Update(agent, optimizer, args, optimizer.vector.new_zeros(args.batch_size, width))
-    arithmetic = f"{'compiled' if update.step is not update.plain_step else 'plain'} on {device.type}"
+    arithmetic = f"{'compiled' if update.is_compiled else 'plain'} on {device.type}"
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     global_step = iteration * args.rollout_steps
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
+    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
@@ -1818,6 +1819,7 @@ def finish_run(agent: Agent, policy, args: Args, run_dir: Path, global_step: int
         "steps_per_second": global_step / seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "versions": {**versions, "python": platform.python_version()},
+        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }
     write_json(run_dir / "result.json", result)
     print_table(result)

@@ -126,7 +126,7 @@ class Args:
     demos_rl: Path | None = None
     """folder of the RL expert's demonstrations; needed for α > 0"""
     demos_human: Path | None = None
-    """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_human/`"""
+    """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_synthetic_human/`"""
     human_episodes: int = 220
     """episodes of 60 s of the synthetic human (section 2.4.3)"""
     alpha: float = 0.5
@@ -1673,10 +1673,10 @@ def record_video(policy, args: Args, run_dir: Path, seed: int) -> None:
     env = make_env(args.env_id, "rgb_array", **env_options(args))
     env = gym.wrappers.RecordVideo(env, str(run_dir / "videos"), lambda episode: True)
     obs, _ = env.reset(seed=seed)
-    ended = False
-    while not ended:
+    for _ in range(MAX_EVALUATION_STEPS):
         obs, _, terminated, truncated, _ = env.step(policy(obs[None])[0])
-        ended = terminated or truncated
+        if terminated or truncated:
+            break
     env.close()
 
 
@@ -1720,7 +1720,11 @@ def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
 
 
 def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
-    """Write episodes in the format of `save_demonstrations`; `about` goes into the manifest."""
+    """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
+
+    Each file has observations (T + 1, O), actions (T, A), rewards (T,), terminated, truncated, seed, and t_ns (T,), the
+    time of each action in nanoseconds, simulated where the environment says how many frames a second has.
+    """
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))
     manifest = {"version": 1, **about, "files": {}}
@@ -1847,11 +1851,10 @@ def main(args: Args) -> int:
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
     write_json(run_dir / "args.json", arguments(args))
-    (run_dir / "result.json").unlink(missing_ok=True)
     print(run_dir)
     if human and args.demos_human is None:
         about = {"env_id": args.env_id, "options": env_options(args), "player": "synthetic human", "mode": "scripted"}
-        write_demonstrations(run_dir / "demos_human", human, about)
+        write_demonstrations(run_dir / "demos_synthetic_human", human, about)
 
     random.seed(args.seed)  # this file draws from neither; for environments that do
     np.random.seed(args.seed)
@@ -1894,6 +1897,7 @@ def main(args: Args) -> int:
     global_step = iteration * args.batch_size
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
+    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
@@ -1987,6 +1991,7 @@ def finish_run(
         "steps_per_second": global_step / seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "versions": {**versions, "python": platform.python_version()},
+        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }
     write_json(run_dir / "result.json", result)
     print_table(result)
