@@ -1327,21 +1327,22 @@ class PolicyVector:
         return torch.func.functional_call(self.mean, dict(zip(self.names, parts)), (obs,)), logstd
 
 
-def fisher_vector_product(policy: PolicyVector, vector, obs, direction: torch.Tensor, damping: float) -> torch.Tensor:
-    """(F + damping · I) v, (P,): F is the Hessian of the mean KL divergence at the policy itself.
+def fisher_product(policy: PolicyVector, vector: torch.Tensor, obs: torch.Tensor, damping: float):
+    """The function v -> (F + damping · I) v, (P,) -> (P,): F is the Hessian of the mean KL divergence at the policy itself.
 
-    For a Gaussian it is Jᵀ J / σ² over the means, averaged over the observations, and 2 I over the log deviations.
+    For a Gaussian it is Jᵀ J / σ² over the means, averaged over the observations (B, O), and 2 I over the log deviations.
     """
-
-    def mean(vector: torch.Tensor) -> torch.Tensor:
-        return policy(vector, obs)[0]
-
+    means, transposed = torch.func.vjp(lambda parameters: policy(parameters, obs)[0], vector)  # u -> Jᵀ u
+    _, jacobian = torch.func.vjp(lambda means: transposed(means)[0], torch.zeros_like(means))  # v -> J v
     size = policy.shapes[-1].numel()
-    _, change = torch.func.jvp(mean, (vector,), (direction,))
-    _, pull_back = torch.func.vjp(mean, vector)
-    (product,) = pull_back(change * (-2 * vector[-size:]).exp() / len(obs))
-    product[-size:] += 2 * direction[-size:]
-    return product + damping * direction
+    weight = (-2 * vector[-size:]).exp() / len(obs)
+
+    def multiply(direction: torch.Tensor) -> torch.Tensor:
+        (product,) = transposed(jacobian(direction)[0] * weight)
+        product[-size:] += 2 * direction[-size:]
+        return product + damping * direction
+
+    return multiply
 
 
 def surrogate(policy: PolicyVector, vector: torch.Tensor, batch: Batch, old_logprobs, ent_coef: float) -> torch.Tensor:
@@ -1361,9 +1362,7 @@ def trpo_step(policy: PolicyVector, batch: Batch, args: Args) -> dict[str, float
     gradient = torch.func.grad(objective)(old)
     before = objective(old)
 
-    def multiply(direction: torch.Tensor) -> torch.Tensor:
-        return fisher_vector_product(policy, old, batch.obs, direction, args.cg_damping)
-
+    multiply = fisher_product(policy, old, batch.obs, args.cg_damping)
     direction = conjugate_gradient(multiply, gradient, args.cg_iterations)
     full = direction * torch.sqrt(2 * args.max_kl / (direction @ multiply(direction)).clamp(min=1e-12))
     for halvings in range(10):

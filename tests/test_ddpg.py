@@ -1,0 +1,234 @@
+"""DDPG: its targets, losses, update, noise and replay buffer against independent sources."""
+
+import copy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+from conftest import needs_compiler
+
+from cleanrl_thesis import ddpg_torcs_like as ddpg
+
+OBS, ACTIONS = 5, 2
+
+
+def make(**flags):
+    """Agent, optimiser, update and a minibatch of random transitions."""
+    args = ddpg.Args(**{"hidden_size": 16, "batch_size": 32, "num_envs": 3, **flags})
+    torch.manual_seed(0)
+    agent = ddpg.Agent(OBS, ACTIONS, args.hidden_size, args.layer_norm)
+    optimizer = ddpg.FlatAdam(agent, args)
+    optimizer.target.add_(0.1 * torch.randn_like(optimizer.target))
+    rows = torch.randn(32, 2 * OBS + ACTIONS + 2)
+    rows[:, OBS + ACTIONS + 1] = 0.99 * (torch.rand(32) < 0.8)
+    return args, agent, optimizer, ddpg.Update(agent, optimizer, args, rows), rows
+
+
+def peer_networks(agent, optimizer):
+    """Copies of the networks and of the target networks as usual modules."""
+    peer, target = copy.deepcopy(agent), copy.deepcopy(agent)
+    for network, vector in ((peer, optimizer.vector), (target, optimizer.target)):
+        for parameter, value in zip(network.parameters(), ddpg.views(vector.clone(), optimizer.shapes)):
+            parameter.data = value.clone()
+    return peer, target
+
+
+@pytest.mark.parametrize("layer_norm", [True, False])
+def test_an_update_is_that_of_two_torch_optimisers(layer_norm):
+    """Lillicrap et al., 2016, Algorithm 1, with both gradients taken before either step, and L2 on the critic's weights."""
+    args, agent, optimizer, update, rows = make(layer_norm=layer_norm)
+    peer, target = peer_networks(agent, optimizer)
+    actor_adam = torch.optim.Adam(peer.actor.parameters(), 1e-4)
+    critic_adam = torch.optim.Adam(peer.critic.parameters(), 1e-3)
+    for _ in range(5):
+        parts = update(rows)
+        obs, actions, rewards, discounts, next_obs = rows.split([OBS, ACTIONS, 1, 1, OBS], 1)
+        with torch.no_grad():
+            goal = rewards[:, 0] + discounts[:, 0] * target.critic(next_obs, target.actor(next_obs))
+        error = ((peer.critic(obs, actions) - goal) ** 2).mean()
+        decay = sum((layer.weight**2).sum() for layer in (peer.critic.first, peer.critic.second))
+        actor_loss = -peer.critic(obs, peer.actor(obs)).mean()
+        assert torch.allclose(torch.stack(parts[:2]), torch.stack([error, actor_loss]), rtol=1e-4, atol=1e-6)
+        gradients = torch.autograd.grad(actor_loss, list(peer.actor.parameters()))
+        critic_adam.zero_grad()
+        (error + 0.5 * args.critic_l2 * decay).backward()
+        for parameter, gradient in zip(peer.actor.parameters(), gradients):
+            parameter.grad = gradient
+        critic_adam.step()
+        actor_adam.step()
+        with torch.no_grad():
+            for slow, fast in zip(target.parameters(), peer.parameters()):
+                slow.mul_(1 - args.tau).add_(args.tau * fast)
+    for ours, theirs in ((optimizer.vector, peer), (optimizer.target, target)):
+        flat = torch.cat([parameter.detach().reshape(-1) for parameter in theirs.parameters()])
+        assert torch.allclose(ours, flat, atol=5e-6)
+
+
+@needs_compiler
+def test_compiled_update_is_the_plain_one():
+    (*_, plain_optimizer, plain, rows), (*_, optimizer, compiled, _) = make(), make(compile=True)
+    assert compiled.is_compiled and not plain.is_compiled
+    for _ in range(20):
+        parts = [torch.stack(update(rows)) for update in (plain, compiled)]
+        assert torch.allclose(parts[0], parts[1], rtol=1e-4, atol=1e-5)
+    assert torch.allclose(plain_optimizer.vector, optimizer.vector, atol=1e-5)
+    assert torch.allclose(plain_optimizer.target, optimizer.target, atol=1e-5)
+
+
+@pytest.mark.parametrize("layer_norm", [True, False])
+def test_the_actor_in_numpy_is_the_actor_in_torch(layer_norm):
+    _, agent, optimizer, *_ = make(layer_norm=layer_norm)
+    obs = torch.randn(7, OBS)
+    parameters = optimizer.actor_arrays(optimizer.actor_vector())
+    with torch.no_grad():
+        agent.actor.output.weight.mul_(300)  # numpy sees the change: it shares the memory
+        assert np.allclose(ddpg.numpy_actions(parameters, obs.numpy()), agent.actor(obs), atol=1e-6)
+    many = optimizer.actor_arrays(np.stack([optimizer.actor_vector() * share for share in np.linspace(0.5, 1, 7)]))
+    for i in range(7):
+        one = {name: array[i] for name, array in many.items()}
+        assert np.allclose(ddpg.numpy_actions(many, obs.numpy())[i], ddpg.numpy_actions(one, obs.numpy()[i : i + 1])[0])
+
+
+def test_noise_is_on_all_parameters_but_the_norms():
+    args, agent, optimizer, *_ = make()
+    noise = ddpg.ParameterNoise(optimizer, args, ACTIONS, np.random.default_rng(0))
+    draws = np.stack([noise.draw() for _ in range(4_000)]) - optimizer.actor_vector()
+    parts = optimizer.actor_arrays(draws)
+    for name, part in parts.items():
+        deviation = part.reshape(4_000, -1).std(0)
+        assert (deviation == 0).all() if "norm" in name else np.allclose(deviation, args.noise_std, rtol=0.1)
+
+
+def test_the_size_of_the_noise_goes_to_where_actions_are_as_far_as_asked():
+    args, agent, optimizer, *_ = make()
+    with torch.no_grad():
+        agent.actor.output.weight.mul_(100)
+    noise = ddpg.ParameterNoise(optimizer, args, ACTIONS, np.random.default_rng(0))
+    obs = np.random.default_rng(1).standard_normal((64, OBS)).astype(np.float32)
+    distances = [noise.adapt(obs) for _ in range(1_500)]
+    assert np.mean(distances[-500:]) == pytest.approx(args.noise_std, rel=0.15)
+    before = noise.size
+    assert (noise.adapt(obs) > args.noise_std) == (noise.size < before)
+    assert max(noise.size, before) / min(noise.size, before) == pytest.approx(1.01)
+
+
+def test_each_environment_has_a_perturbed_actor_of_its_own():
+    args, _, optimizer, *_ = make()
+    noise = ddpg.ParameterNoise(optimizer, args, ACTIONS, np.random.default_rng(0))
+    for i in range(3):
+        noise.begin(i)
+    obs = np.tile(np.ones(OBS, np.float32), (3, 1))
+    first = noise.act(obs)
+    assert len(np.unique(first, axis=0)) == 3
+    noise.begin(1)
+    assert (noise.act(obs) == first).all(1).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "ou", "none"])
+def test_noise_on_actions(kind):
+    """Deviations: of a Gaussian as given; of the Ornstein-Uhlenbeck process 0.1 σ / √(1 − (1 − 0.0015)²)."""
+    args, _, optimizer, *_ = make(noise=kind)
+    noise = ddpg.ActionNoise(optimizer, args, ACTIONS, np.random.default_rng(0))
+    obs = np.zeros((3, OBS), np.float32)
+    actions = np.stack([noise.act(obs) for _ in range(20_000)])
+    greedy = ddpg.numpy_actions(optimizer.actor_arrays(optimizer.actor_vector()), obs)
+    if kind == "ou":
+        steps = noise.noise.copy()
+        follow = np.stack([(noise.act(obs), noise.noise.copy())[1] for _ in range(20_000)])
+        previous = np.concatenate([steps[None], follow[:-1]])
+        assert (follow - previous + 0.15 * 0.01 * previous).std() == pytest.approx(0.1 * 0.2, rel=0.02)
+        noise.begin(1)
+        assert (noise.noise[1] == 0).all() and (noise.noise[0] != 0).all()
+    else:
+        assert np.allclose((actions - greedy).std(), 0.2 if kind == "gaussian" else 0, rtol=0.02)
+
+
+def test_the_ring_keeps_the_last_transitions(tmp_path):
+    buffer = ddpg.ReplayBuffer(tmp_path / "replay.dat", capacity=10, spare=4, width=8)
+    for i in range(0, 36, 3):
+        numbers = np.arange(i, i + 3, dtype=np.float64)
+        pairs = np.repeat(numbers[:, None], 2, 1)
+        buffer.add(pairs, pairs + 0.5, numbers, np.full(3, 0.9), pairs + 1)
+    rows = buffer.sample(3_000, np.random.default_rng(0))
+    assert sorted(set(rows[:, 4].tolist())) == list(range(26, 36))
+    assert torch.equal(rows[:, 0], rows[:, 4]) and torch.equal(rows[:, 2], rows[:, 4] + 0.5)
+    assert torch.equal(rows[:, 7], rows[:, 4] + 1) and torch.allclose(rows[:, 5], torch.tensor(0.9))
+    counts = np.bincount(rows[:, 4].numpy().astype(int) - 26)
+    assert scipy.stats.chisquare(counts).pvalue > 1e-3
+    again = ddpg.ReplayBuffer(tmp_path / "replay.dat", capacity=10, spare=4, width=8, added=36)
+    assert np.array_equal(again.array, buffer.array)
+
+
+class Counter(gym.Env):
+    """Observes its step; ends after 4 steps, by a time-out in every second episode."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    episodes = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.step_number, self.episodes = 0, self.episodes + 1
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.step_number += 1
+        over, times_out = self.step_number == 4, self.episodes % 2 == 0
+        return np.full(1, self.step_number, np.float32), 1.0, over and not times_out, over and times_out, {}
+
+
+def test_players_return_the_real_next_observation_and_go_on():
+    players = ddpg.GymPlayers([Counter(), Counter()], seed=0)
+    players.start()
+    for episode in range(3):
+        for t in range(1, 5):
+            steps = players.step(np.zeros((2, 1)))
+            assert steps.next_obs[:, 0].tolist() == [t, t]
+            assert steps.terminated.tolist() == [t == 4 and episode % 2 == 0] * 2
+            assert steps.ended == ([(0, 4.0, 4), (1, 4.0, 4)] if t == 4 else [])
+            assert players.obs[:, 0].tolist() == [t % 4, t % 4]
+
+
+def test_cars_have_seeds_of_their_own_and_are_restored():
+    """As the single environment's; and in a second instance from the saved arrays, bit for bit."""
+
+    def begin():
+        return ddpg.CarPlayers(ddpg.TorcsLikeVectorEnv(3), seed=5)
+
+    players, rng = begin(), np.random.default_rng(0)
+    players.start()
+    single = ddpg.TorcsLikeEnv()
+    assert np.array_equal(single.reset(seed=ddpg.episode_seed(5, 2, 0))[0], players.obs[2])
+    ended = []
+    for _ in range(400):
+        ended += players.step(rng.uniform([0, 0.2], [0.3, 1], (3, 2))).ended
+    assert len(ended) > 3
+    other = begin()
+    assert other.load_state_dict(copy.deepcopy(players.state_dict()))
+    for _ in range(400):
+        actions = rng.uniform([0, 0.2], [0.3, 1], (3, 2))
+        ours, theirs = players.step(actions), other.step(actions)
+        assert np.array_equal(ours.next_obs, theirs.next_obs) and np.array_equal(players.obs, other.obs)
+        assert ours.ended == theirs.ended
+
+
+# Scores
+def test_window_scores_by_hand():
+    """Windows of 250 steps: whole, of a crash, cut short."""
+    drive = np.full(600, 0.5)
+    assert ddpg.window_scores(drive) == [125.0, 125.0]
+    crash = np.append(drive[:400], -1.0)
+    assert ddpg.window_scores(crash) == [125.0, 0.0]
+    assert ddpg.window_scores(np.array([0.5, -1.0])) == [0.0]
+    assert ddpg.window_scores(np.full(20, 0.5)) == []
+    scores = ddpg.driving_scores([{"rewards": drive}, {"rewards": crash}], 100.0)
+    assert scores["metres_in_5_s"]["mean"] == (125 + 62.5) / 2 and scores["score"]["max"] == 450
+    assert scores["crashes"] == 1 and scores["laps"] == [3.0, 2.0]
+
+
+def test_actions_are_scaled_to_the_bounds():
+    space = gym.spaces.Box(np.array([-2, 0], np.float32), np.array([2, 1], np.float32))
+    scaled = ddpg.scaled(np.array([[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0]]), space)
+    assert scaled.tolist() == [[-2, 0], [0, 0.5], [2, 1]]

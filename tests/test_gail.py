@@ -1,0 +1,201 @@
+"""TRPO, the hybrid discriminator and the synthetic driver against independent sources."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import scipy.sparse.linalg
+import torch
+
+from cleanrl_thesis import gail_hybrid as gail
+
+OBS, ACTIONS = 6, 3
+
+
+def make_batch(size: int = 256, seed: int = 0):
+    """An agent whose policy is no longer its beginning, its policy as a vector, and a batch of its own steps."""
+    torch.manual_seed(seed)
+    agent = gail.Agent(OBS, ACTIONS, 32)
+    policy = gail.PolicyVector(agent)
+    policy.vector.add_(0.05 * torch.randn_like(policy.vector))
+    obs = torch.randn(size, OBS)
+    with torch.no_grad():
+        mean, logstd = policy(policy.vector, obs)
+        actions = mean + logstd.exp() * torch.randn(size, ACTIONS)
+    advantages = (actions[:, 0] * obs[:, 0]).detach() + 0.1 * torch.randn(size)
+    advantages = (advantages - advantages.mean()) / advantages.std()
+    return agent, policy, gail.Batch(obs, actions, actions, advantages, torch.randn(size))
+
+
+# TRPO
+def test_conjugate_gradient_against_scipy():
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((30, 30))
+    matrix, b = root @ root.T + 30 * np.eye(30), rng.standard_normal(30)
+    tensors = torch.from_numpy(matrix), torch.from_numpy(b)
+    for iterations in (3, 10):
+        ours = gail.conjugate_gradient(lambda v: tensors[0] @ v, tensors[1], iterations)
+        theirs, _ = scipy.sparse.linalg.cg(matrix, b, rtol=0, maxiter=iterations)
+        assert np.allclose(ours, theirs)
+    ours = gail.conjugate_gradient(lambda v: tensors[0] @ v, tensors[1], 60)
+    assert np.allclose(ours, np.linalg.solve(matrix, b), atol=1e-5)
+
+
+def test_fisher_products_are_those_of_the_hessian_of_the_kl_divergence():
+    _, policy, batch = make_batch(50)
+    old = policy.vector.clone().double()
+    obs = batch.obs.double()
+    policy.mean.double()
+    with torch.no_grad():
+        old_mean, old_logstd = policy(old, obs)
+
+    def kl(vector: torch.Tensor) -> torch.Tensor:
+        mean, logstd = policy(vector, obs)
+        ours = torch.distributions.Normal(old_mean, old_logstd.exp())
+        return torch.distributions.kl_divergence(ours, torch.distributions.Normal(mean, logstd.exp())).sum(1).mean()
+
+    hessian = torch.autograd.functional.hessian(kl, old)
+    multiply = gail.fisher_product(policy, old, obs, 0.1)
+    for seed in range(3):
+        v = torch.randn(len(old), dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+        expected = hessian @ v + 0.1 * v
+        assert (multiply(v) - expected).norm() < 1e-6 * expected.norm()
+
+
+def test_a_step_of_trpo_improves_the_surrogate_within_the_bound():
+    args = gail.Args(alpha=0.0)
+    for seed in range(5):
+        agent, policy, batch = make_batch(seed=seed)
+        old = policy.vector.clone()
+        metrics = gail.trpo_step(policy, batch, args)
+        assert 0 < metrics["losses/kl"] <= 1.5 * args.max_kl and metrics["losses/gain"] > 0
+        with torch.no_grad():
+            (mean, logstd), (old_mean, old_logstd) = policy(policy.vector, batch.obs), policy(old, batch.obs)
+            pairs = [torch.distributions.Normal(m, s.exp()) for m, s in ((old_mean, old_logstd), (mean, logstd))]
+            kl = torch.distributions.kl_divergence(*pairs).sum(1).mean()
+            assert torch.allclose(agent.actor_mean(batch.obs), mean)  # the agent's own parameters have moved
+        assert kl.item() == pytest.approx(metrics["losses/kl"], rel=1e-3)
+
+
+def test_without_damping_the_full_step_is_as_long_as_the_bound_allows():
+    """½ sᵀ F s = max KL for the step before the line search; in a quadratic model that is the KL divergence."""
+    args = gail.Args(alpha=0.0, cg_damping=1e-4, max_kl=1e-5, cg_iterations=60)
+    _, policy, batch = make_batch(2_000)
+    metrics = gail.trpo_step(policy, batch, args)
+    assert metrics["charts/halvings"] == 0 and metrics["losses/kl"] == pytest.approx(1e-5, rel=0.1)
+
+
+def test_no_step_is_taken_where_none_helps():
+    args = gail.Args(alpha=0.0)
+    _, policy, batch = make_batch()
+    old = policy.vector.clone()
+    metrics = gail.trpo_step(policy, batch._replace(advantages=torch.zeros(256)), args)
+    assert torch.equal(policy.vector, old) and metrics["losses/kl"] == 0
+
+
+def test_gae_by_the_definition():
+    """Sums of (γλ)^l δ, over every episode; behind a time-out the value goes on, behind an end it does not."""
+    rng = np.random.default_rng(0)
+    rewards, values, next_values = rng.standard_normal((3, 12, 2))
+    ended = rng.random((12, 2)) < 0.3
+    terminated = ended & (rng.random((12, 2)) < 0.5)
+    found = gail.gae(rewards, values, next_values, terminated, ended, 0.9, 0.8)
+    for i in range(2):
+        for t in range(12):
+            expected, weight = 0.0, 1.0
+            for k in range(t, 12):
+                follows = 0.0 if terminated[k, i] else 0.9 * next_values[k, i]
+                expected += weight * (rewards[k, i] + follows - values[k, i])
+                weight *= 0.9 * 0.8
+                if ended[k, i]:
+                    break
+            assert found[t, i] == pytest.approx(expected)
+
+
+# The discriminator
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
+def test_discriminator_loss_against_the_equation(alpha):
+    """−L_mix of Eq. 2.3.1, summed by hand, less the entropy of D's verdicts."""
+    generator = torch.Generator().manual_seed(0)
+    student, rl, human = (torch.randn(size, generator=generator) for size in (20, 20, 20))
+    loss, metrics = gail.discriminator_loss(student, rl, human, alpha, 0.01)
+    d = [[1 / (1 + math.exp(-logit)) for logit in part.tolist()] for part in (student, rl, human)]
+    l_mix = sum(math.log(x) for x in d[0]) / 20
+    l_mix += alpha * sum(math.log(1 - x) for x in d[1]) / 20 + (1 - alpha) * sum(math.log(1 - x) for x in d[2]) / 20
+    entropy = -sum(x * math.log(x) + (1 - x) * math.log(1 - x) for part in d for x in part) / 60
+    assert metrics["losses/l_mix"].item() == pytest.approx(l_mix, rel=1e-5)
+    assert loss.item() == pytest.approx(-l_mix - 0.01 * entropy, rel=1e-5)
+    assert list(metrics) == list(gail.DISCRIMINATOR_METRICS)
+
+
+def test_the_best_discriminator_is_the_student_s_share():
+    """For densities p of the student and q = α RL + (1 − α) HE, Eq. 2.3.1 is greatest at D = p / (p + q)."""
+    p, rl, human, alpha = (
+        torch.tensor([0.5, 0.3, 0.2]),
+        torch.tensor([0.1, 0.8, 0.1]),
+        torch.tensor([0.3, 0.3, 0.4]),
+        0.3,
+    )
+    logits = torch.zeros(3, requires_grad=True)
+    optimizer = torch.optim.Adam([logits], 0.05)
+    draws = [torch.multinomial(x, 400_000, True, generator=torch.Generator().manual_seed(0)) for x in (p, rl, human)]
+    counts = [torch.bincount(draw, minlength=3) / 400_000 for draw in draws]
+    for _ in range(800):
+        parts = [
+            (F * n).sum()
+            for F, n in zip(
+                (torch.nn.functional.logsigmoid(logits), *2 * [torch.nn.functional.logsigmoid(-logits)]), counts
+            )
+        ]
+        loss = -(parts[0] + alpha * parts[1] + (1 - alpha) * parts[2])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    q = alpha * rl + (1 - alpha) * human
+    assert torch.allclose(torch.sigmoid(logits), p / (p + q), atol=0.01)
+    pieces = [logits.detach()[draw[:50_000]] for draw in draws]
+    found, _ = gail.discriminator_loss(*pieces, alpha, 0.0)
+    assert found.item() == pytest.approx(loss.item(), abs=0.01)
+
+
+def test_the_student_is_paid_for_looking_like_the_experts():
+    logits = torch.tensor([-3.0, 0.0, 3.0])  # like an expert, undecided, like the student
+    positive, signed = (gail.imitation_reward(logits, form) for form in ("positive", "signed"))
+    assert torch.allclose(positive, -torch.log(torch.sigmoid(logits)))
+    assert torch.allclose(signed, torch.log(1 - torch.sigmoid(logits)) - torch.log(torch.sigmoid(logits)), atol=1e-5)
+    assert (positive > 0).all() and (positive.diff() < 0).all() and (signed.diff() < 0).all()
+
+
+# Demonstrations and driver
+def test_the_synthetic_driver_is_the_same_for_the_same_seed_and_reacts_late():
+    def drive(seed: int) -> list[dict]:
+        games = gail.TorcsLikeVectorEnv(3)
+        return gail.play(gail.SyntheticDriver(games.cars, seed), games, [1, 2, 3], keep=True)
+
+    runs = [drive(seed) for seed in (5, 5, 6)]
+    same, other = (all(np.array_equal(a["actions"], b["actions"]) for a, b in zip(runs[0], run)) for run in runs[1:])
+    assert same and not other
+    for episode in runs[0]:
+        pedal = episode["actions"][:, 1]
+        assert (pedal[: gail.SyntheticDriver.reaction] == 0).all() and (
+            pedal[: gail.SyntheticDriver.reaction + 1] > 0
+        ).any()
+        changes = np.mean((np.diff(episode["actions"], axis=0) != 0).any(1))
+        assert 1 / 20 < changes < 1 / 5  # hands move some five times a second
+
+
+def test_demonstrations_are_normalised_and_within_bounds():
+    space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    rng = np.random.default_rng(0)
+    episode = {"observations": rng.normal(3, 2, (1_001, 4)), "actions": rng.normal(0, 2, (1_000, 2))}
+    demonstrations = gail.Demonstrations([episode], space)
+    assert demonstrations.actions.abs().max() == 1 and len(demonstrations.obs) == 1_000
+    agent = gail.Agent(4, 2, 8)
+    agent.set_normalisation(demonstrations.obs)
+    normalised = agent.normalise(demonstrations.obs)
+    assert normalised.mean(0).abs().max() < 1e-5 and (normalised.std(0) - 1).abs().max() < 1e-3
+    obs, actions = demonstrations.sample(50)
+    for row, action in zip(obs, actions):
+        i = (demonstrations.obs == row).all(1).nonzero()[0, 0]
+        assert torch.equal(demonstrations.actions[i], action)
