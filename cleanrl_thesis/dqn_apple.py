@@ -1039,8 +1039,8 @@ def save_demonstrations(agent: QNetwork, args: Args, run_dir: Path) -> None:
 def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
     """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
 
-    Each file has observations (T + 1, ...), actions (T,), rewards (T,), terminated, truncated, seed, and t_ns (T,), the
-    time of each action in nanoseconds, simulated where the environment says how many frames a second has.
+    Each file has observations (T + 1, ...), actions (T, ...), rewards (T,), terminated, truncated, seed, and t_ns (T,),
+    the time of each action in nanoseconds, simulated where the environment says how many frames a second has.
     """
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))

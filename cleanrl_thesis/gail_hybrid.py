@@ -925,10 +925,11 @@ def read_demonstrations(folder: Path, args: Args, flag: str) -> list[dict[str, n
     """All episodes of a folder, in the order of their names. Raises UsageError."""
     try:
         manifest = json.loads((folder / "manifest.json").read_text())
-        files, recorded = dict(manifest["files"]), str(manifest["env_id"])
+        files, recorded, version = dict(manifest["files"]), str(manifest["env_id"]), manifest["version"]
         options = dict(manifest.get("options", {}))
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"{flag} {folder}: holds no demonstrations, it has no readable manifest.json") from None
+    require(version == 1, flag, folder, f"its manifest is of version {version}, this script reads version 1")
     require(bool(files), flag, folder, "holds no demonstrations, its manifest names no file")
     same_task = recorded.split(":")[-1].split("/")[-1] == args.env_id.split(":")[-1].split("/")[-1]
     require(same_task, flag, folder, f"was recorded in {recorded}, --env-id is {args.env_id}")
@@ -1721,8 +1722,8 @@ def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
 def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
     """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
 
-    Each file has observations (T + 1, O), actions (T, A), rewards (T,), terminated, truncated, seed, and t_ns (T,), the
-    time of each action in nanoseconds, simulated where the environment says how many frames a second has.
+    Each file has observations (T + 1, ...), actions (T, ...), rewards (T,), terminated, truncated, seed, and t_ns (T,),
+    the time of each action in nanoseconds, simulated where the environment says how many frames a second has.
     """
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))

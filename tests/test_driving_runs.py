@@ -1,0 +1,318 @@
+"""ddpg_torcs_like.py and gail_hybrid.py through the command line: runs, resumes, and what a user can get wrong."""
+
+import hashlib
+import io
+import json
+import shutil
+import signal
+import subprocess
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, command, kill_twice, needs_compiler, run
+
+from cleanrl_thesis import ddpg_torcs_like as ddpg
+from cleanrl_thesis import gail_hybrid as gail
+
+DDPG, GAIL = ROOT / "cleanrl_thesis" / "ddpg_torcs_like.py", ROOT / "cleanrl_thesis" / "gail_hybrid.py"
+SMALL_DDPG = [
+    *("--total-timesteps", 8_000, "--num-envs", 5, "--buffer-size", 3_000, "--batch-size", 16, "--train-steps", 20),
+    *("--hidden-size", 16, "--perturb-interval", 100, "--checkpoint-interval", 1_000, "--eval-episodes", 2),
+]
+SMALL_GAIL = [
+    *("--total-timesteps", 5_120, "--num-envs", 4, "--num-steps", 64, "--human-episodes", 2, "--hidden-size", 16),
+    *("--checkpoint-interval", 1, "--eval-episodes", 2),
+]
+RECORDS = ("episodes.csv", "updates.csv", "evaluation.json")
+
+
+@pytest.fixture(scope="session")
+def expert(tmp_path_factory) -> Path:
+    """An undisturbed small run of DDPG."""
+    folder = tmp_path_factory.mktemp("ddpg")
+    run(*SMALL_DDPG, "--run-dir", "run", "--save-model", "--save-demos", 2, cwd=folder, script=DDPG)
+    return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def student(tmp_path_factory, expert) -> Path:
+    """An undisturbed small run of the hybrid."""
+    folder = tmp_path_factory.mktemp("gail")
+    flags = ["--demos-rl", expert / "demos", "--run-dir", "run", "--save-model", "--save-demos", 2]
+    run(*SMALL_GAIL, *flags, cwd=folder, script=GAIL)
+    return folder / "run"
+
+
+def flat(state: object) -> list[torch.Tensor]:
+    """All tensors of a nested state."""
+    if isinstance(state, torch.Tensor):
+        return [state]
+    parts = state.values() if isinstance(state, dict) else state if isinstance(state, (list, tuple)) else []
+    return [tensor for part in parts for tensor in flat(part)]
+
+
+def assert_same_run(left: Path, right: Path) -> None:
+    """Same bytes in the records, same tensors in the checkpoints."""
+    for name in RECORDS:
+        assert (left / name).read_bytes() == (right / name).read_bytes(), name
+    states = [torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (left, right)]
+    for part in ("agent", "optimizer", "players"):
+        pairs = [flat(state.get(part, {})) for state in states]
+        assert len(pairs[0]) == len(pairs[1]) and all(torch.equal(*pair) for pair in zip(*pairs)), part
+
+
+def kill(script: Path, flags: list, folder: Path, number: int, at_row: int) -> None:
+    """Start or resume a run and send it a signal once its updates.csv has `at_row` rows."""
+    line = command(*flags, "--run-dir", folder, "--resume", script=script)
+    process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    path = folder / ("updates.csv" if script == GAIL else "episodes.csv")
+    while process.poll() is None and not (path.exists() and path.read_bytes().count(b"\n") >= at_row):
+        time.sleep(0.002)
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == (-number if number == signal.SIGKILL else 128 + number), out
+
+
+@pytest.mark.parametrize("kind", ["ddpg", "ddpg, other task", "gail"])
+def test_a_killed_run_ends_with_the_same_bytes(kind, expert, student, tmp_path):
+    script, flags, whole, rows = {
+        "ddpg": (DDPG, SMALL_DDPG, expert, (10, 40, 70)),
+        "ddpg, other task": (
+            DDPG,
+            [*SMALL_DDPG, "--env-id", "Pendulum-v1", "--noise", "ou", "--checkpoint-interval", 700],
+            tmp_path / "whole",
+            (3, 9, 15),
+        ),
+        "gail": (GAIL, [*SMALL_GAIL, "--demos-rl", expert / "demos"], student, (4, 9, 14)),
+    }[kind]
+    if kind == "ddpg, other task":
+        run(*flags, "--run-dir", whole, cwd=tmp_path, script=script)
+    for number, at_row in zip((signal.SIGKILL, signal.SIGKILL, signal.SIGTERM), rows):
+        kill(script, flags, tmp_path / "run", number, at_row)
+    done = run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path, script=script)
+    assert "differs" not in done.stderr
+    assert_same_run(whole, tmp_path / "run")
+
+
+def test_ddpg_with_a_torn_checkpoint_finds_its_replay_buffer(expert, tmp_path):
+    shutil.copytree(expert, tmp_path / "run")
+    path = tmp_path / "run" / "checkpoint.pt"
+    path.write_bytes(path.read_bytes()[:1000])
+    (tmp_path / "run" / "result.json").unlink()
+    done = run(*SMALL_DDPG, "--run-dir", "run", "--resume", cwd=tmp_path, script=DDPG)
+    assert "torn" in done.stderr
+    assert_same_run(expert, tmp_path / "run")
+
+
+@needs_compiler
+def test_compiled_through_the_command_line(tmp_path):
+    done = run(*SMALL_DDPG, "--compile", "--run-dir", "run", cwd=tmp_path, script=DDPG)
+    assert "--compile" not in done.stderr
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert state["arithmetic"] == "compiled on cpu"
+
+
+def test_copied_alone_into_an_empty_folder(expert, student, tmp_path):
+    for script in (DDPG, GAIL):
+        shutil.copy(script, tmp_path)
+    run(*SMALL_DDPG, "--run-dir", "ddpg", cwd=tmp_path, script=tmp_path / DDPG.name, PYTHONSAFEPATH="1")
+    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--run-dir", "gail"]
+    run(*flags, cwd=tmp_path, script=tmp_path / GAIL.name, PYTHONSAFEPATH="1")
+    assert (tmp_path / "ddpg" / "updates.csv").read_bytes() == (expert / "updates.csv").read_bytes()
+    assert (tmp_path / "gail" / "updates.csv").read_bytes() == (student / "updates.csv").read_bytes()
+
+
+def test_runs_leave_what_the_readme_says(expert, student):
+    shared = {"args.json", "checkpoint.pt", "checkpoint.previous.pt", "evaluation.json", "learning_curve.png"}
+    shared |= {"model.safetensors", "result.json", "episodes.csv", "updates.csv", "demos"}
+    events = {path.name for path in (*expert.iterdir(), *student.iterdir()) if "tfevents" in path.name}
+    assert {path.name for path in expert.iterdir()} - events == {*shared, "replay.dat"}
+    assert {path.name for path in student.iterdir()} - events == {*shared, "demos_synthetic_human"}
+
+
+@pytest.mark.parametrize("kind", ["expert", "student"])
+def test_demonstrations_can_be_played_again(kind, request):
+    folder = request.getfixturevalue(kind) / "demos"
+    assert json.loads((folder / "manifest.json").read_text())["options"]["track"] == "meadow"
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path, allow_pickle=False) as arrays:
+            seed, times, rewards = int(arrays["seed"]), arrays["t_ns"], arrays["rewards"]
+            actions, observations = arrays["actions"], arrays["observations"]
+        env = ddpg.make_env("TorcsLike-v0")
+        obs = [env.reset(seed=seed)[0]]
+        for action, reward in zip(actions, rewards):
+            step = env.step(action)
+            obs.append(step[0])
+            assert step[1] == reward
+        assert np.array_equal(obs, observations) and (step[2] or step[3])
+        assert times[50] == pytest.approx(1e9)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--noise", "gaussian", "--track-name", "city", "--no-brake"],
+        ["--reward", "speed", "--no-layer-norm", "--noise", "none", "--reward-scale", 0.01],
+        ["--env-id", "cleanrl_thesis.ddpg_torcs_like:TorcsLike-v0", "--track-name", "hills"],
+    ],
+)
+def test_other_ways_to_train_an_expert(flags, tmp_path):
+    run(*SMALL_DDPG, "--total-timesteps", 1_000, *flags, "--run-dir", "run", cwd=tmp_path, script=DDPG)
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["evaluation"]["driving"]["score"]["episodes"] >= 0
+
+
+def test_a_student_of_another_task(tmp_path):
+    """GAIL on Pendulum, from demonstrations of a small DDPG run; a warm start, the signed reward."""
+    flags = ["--env-id", "Pendulum-v1", "--save-demos", 3, "--run-dir", "expert", "--eval-episodes", 2]
+    run(*SMALL_DDPG, *flags, cwd=tmp_path, script=DDPG)
+    flags = ["--env-id", "Pendulum-v1", "--alpha", 1, "--demos-rl", "expert/demos", "--run-dir", "run"]
+    more = ["--bc-epochs", 2, "--reward-form", "signed", "--d-steps", 2]
+    run(*SMALL_GAIL, *flags, *more, cwd=tmp_path, script=GAIL)
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["experts"].keys() == {"rl"} and not (tmp_path / "run" / "demos_synthetic_human").exists()
+
+
+def test_recorded_demonstrations_are_those_that_are_learned_from(student, expert, tmp_path):
+    """The synthetic human's folder given as a recording leads to the same student."""
+    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--demos-human", student / "demos_synthetic_human"]
+    run(*flags, "--run-dir", "run", cwd=tmp_path, script=GAIL)
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (student / "updates.csv").read_bytes()
+
+
+# What a user can get wrong
+def assert_refused(module, capsys, flags: list, words: list[str]) -> None:
+    """Exit code 2, one line on stderr with the words, nothing on stdout."""
+    assert module.cli([str(flag) for flag in flags]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and err.startswith("error: "), err
+    for word in words:
+        assert word in err, err
+
+
+BAD_DDPG = [
+    (["--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "Box actions"]),
+    (["--env-id", "NoSuchTask-v0"], ["NoSuchTask"]),
+    (["--track-name", "monza"], ["--track-name", "monza", "meadow"]),
+    (["--rollout-steps", 15], ["--rollout-steps", "15", "multiple", "10"]),
+    (["--total-timesteps", 50], ["--total-timesteps", "50", "100"]),
+    (["--batch-size", 64, "--buffer-size", 32], ["--batch-size", "64", "32"]),
+    (["--tau", 2], ["--tau", "2.0", "between 0 and 1"]),
+    (["--gamma", "nan"], ["--gamma", "nan"]),
+    (["--noise", "pink"], ["--noise", "pink"]),
+    (["--noise-std", -1], ["--noise-std", "-1.0"]),
+    (["--resume"], ["--resume", "--run-dir"]),
+]
+BAD_GAIL = [
+    (["--alpha", 0.5], ["--alpha", "0.5", "--demos-rl"]),
+    (["--alpha", 1.5], ["--alpha", "1.5", "between 0 and 1"]),
+    (["--alpha", 0, "--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "--demos-human"]),
+    (["--alpha", 0, "--max-kl", 0], ["--max-kl", "0.0"]),
+    (["--alpha", 0, "--num-steps", 1], ["--num-steps", "1"]),
+    (["--alpha", 0, "--total-timesteps", 100], ["--total-timesteps", "100", "1024"]),
+    (["--alpha", 0, "--reward-form", "odd"], ["--reward-form", "odd"]),
+    (["--alpha", 1, "--demos-rl", "no/such/folder"], ["--demos-rl", "no/such/folder", "manifest"]),
+    (["--alpha", 0, "--demos-human", "no/such/folder"], ["--demos-human", "no/such/folder", "manifest"]),
+]
+
+
+@pytest.mark.parametrize(
+    "module, flags, words",
+    [(ddpg, *case) for case in BAD_DDPG] + [(gail, *case) for case in BAD_GAIL],
+    ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) and str(value[0])[:2] == "--" else "",
+)
+def test_a_wrong_value_is_one_line_and_creates_nothing(module, flags, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(module, capsys, flags, words)
+    assert not list(tmp_path.iterdir())
+
+
+def rewrite(folder: Path, change) -> None:
+    """Change the arrays of the first demonstration and sign it anew."""
+    path = folder / "episode_00000.npz"
+    with np.load(path) as arrays:
+        changed = change(dict(arrays))
+    content = io.BytesIO()
+    np.savez(content, **changed)
+    path.write_bytes(content.getvalue())
+    edit_manifest(folder, lambda manifest: manifest["files"].update({path.name: digest(path)}))
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def edit_manifest(folder: Path, change) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def flip_a_byte(folder: Path) -> None:
+    path = folder / "episode_00000.npz"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "damage, words",
+    [
+        (lambda folder: [path.unlink() for path in folder.iterdir()], ["no readable manifest.json"]),
+        (lambda folder: edit_manifest(folder, lambda m: m.update(files={})), ["names no file"]),
+        (lambda folder: edit_manifest(folder, lambda m: m.update(version=2)), ["version 2"]),
+        (lambda folder: edit_manifest(folder, lambda m: m.update(env_id="Hopper-v4")), ["Hopper-v4", "TorcsLike-v0"]),
+        (lambda folder: edit_manifest(folder, lambda m: m["options"].update(track="city")), ["city", "meadow"]),
+        (lambda folder: (folder / "episode_00000.npz").unlink(), ["episode_00000.npz", "cannot be read"]),
+        (flip_a_byte, ["episode_00000.npz", "SHA-256"]),
+        (lambda f: rewrite(f, lambda a: {**a, "observations": a["observations"][:, :5]}), ["(T + 1, 65)"]),
+        (lambda f: rewrite(f, lambda a: {**a, "actions": a["actions"][:, 0]}), ["(T, 2)"]),
+        (lambda f: rewrite(f, lambda a: {**a, "actions": a["actions"] * np.nan}), ["actions", "finite"]),
+        (lambda f: rewrite(f, lambda a: {**a, "rewards": a["rewards"][:5]}), ["rewards"]),
+        (lambda f: rewrite(f, lambda a: {**a, "actions": np.array([{}], object)}), ["no demonstration"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_wrong_demonstration_is_named(damage, words, expert, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(expert / "demos", "demos")
+    damage(Path("demos"))
+    flags = ["--alpha", 1, "--demos-rl", "demos", "--run-dir", "run"]
+    assert_refused(gail, capsys, flags, ["--demos-rl demos", *words])
+    assert not Path("run").exists()
+
+
+def test_a_resume_with_other_hyperparameters_or_demonstrations_is_refused(student, expert, tmp_path, capsys):
+    shutil.copytree(student, tmp_path / "run")
+    shutil.copytree(expert / "demos", tmp_path / "demos")
+    flags = [*SMALL_GAIL, "--run-dir", tmp_path / "run", "--resume", "--demos-rl"]
+    changed = [*flags, expert / "demos", "--gamma", 0.9]
+    assert_refused(gail, capsys, changed, ["--gamma 0.9", "was"])
+    rewrite(expert / "demos", lambda arrays: {**arrays, "actions": -arrays["actions"]})
+    try:
+        assert_refused(gail, capsys, [*flags, expert / "demos", "--eval-episodes", 3], ["--resume", "demonstrations"])
+    finally:
+        shutil.rmtree(expert / "demos")
+        shutil.copytree(tmp_path / "demos", expert / "demos")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("kind", ["ddpg", "gail"])
+def test_twenty_runs_killed_at_random_end_with_the_same_bytes(kind, expert, tmp_path):
+    """Each is killed twice, at any moment from the start of Python on."""
+    script, flags = {"ddpg": (DDPG, SMALL_DDPG), "gail": (GAIL, [*SMALL_GAIL, "--demos-rl", expert / "demos"])}[kind]
+    start = time.time()
+    run(*flags, "--run-dir", "whole", cwd=tmp_path, script=script)
+    seconds = time.time() - start
+
+    def kill_and_resume(number: int) -> None:
+        kill_twice([*flags, "--run-dir", tmp_path / f"run{number}"], seconds, number, script)
+        run(*flags, "--run-dir", f"run{number}", "--resume", cwd=tmp_path, script=script)
+        assert_same_run(tmp_path / "whole", tmp_path / f"run{number}")
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(kill_and_resume, range(20)))
