@@ -3,10 +3,11 @@
 # nearer to the DQN ("quick"); the runs behind benchmark/results/apple/.
 # Can be sent again after every stop. Two runs at a time: about 3 hours on 2 cores.
 #   benchmark/apple_alpha.sh
-#   SEEDS="1" FEWER_SEEDS="1" WORKERS=1 benchmark/apple_alpha.sh
+#   SEEDS="1" WORKERS=1 benchmark/apple_alpha.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
-SEEDS=${SEEDS:-1 2 3 4 5} FEWER_SEEDS=${FEWER_SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
+SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
+FEWER_SEEDS=${FEWER_SEEDS:-$(echo $SEEDS | cut -d " " -f 1-3)}
 ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
 OTHER_ALPHAS=${OTHER_ALPHAS:-0.93 1.0 0.5 0.7 0.8 0.3 0.9}
 mkdir -p "$RUNS"
