@@ -77,7 +77,7 @@ def kill(script: Path, flags: list, folder: Path, number: int, at_row: int) -> N
     assert process.returncode == (-number if number == signal.SIGKILL else 128 + number), out
 
 
-@pytest.mark.parametrize("kind", ["ddpg", "ddpg, other task", "gail"])
+@pytest.mark.parametrize("kind", ["ddpg", pytest.param("ddpg, other task", marks=pytest.mark.slow), "gail"])
 def test_a_killed_run_ends_with_the_same_bytes(kind, expert, student, tmp_path):
     script, flags, whole, rows = {
         "ddpg": (DDPG, SMALL_DDPG, expert, (5, 20, 30)),
