@@ -209,8 +209,7 @@ def kept_table(rows: list[dict]) -> str:
     lines = ["| α, T = 0.01 | kept epochs | sampled, kept less last | greedy, kept less last |", "|---|---|---|---|"]
     curves = {mode: alpha_curve(rows, mode) for mode in ACTS}
     for alpha in curves["sampled"]:
-        kept = [row for row in select(rows, f"alpha{alpha}", "sampled")]
-        epochs = ", ".join(str(row["kept_epoch"]) for row in kept)
+        epochs = ", ".join(str(row["kept_epoch"]) for row in select(rows, f"alpha{alpha}", "sampled"))
         costs = [
             paired_difference(curves[mode][alpha], curves[f"last_{mode}"][alpha]) for mode in ("sampled", "greedy")
         ]

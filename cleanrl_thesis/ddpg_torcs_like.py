@@ -16,7 +16,7 @@ after every crash: on the same machine the run ends with the same bytes.
 | updates | 50 after every 100 steps | OpenAI Baselines' defaults |
 | noise | on the parameters, adapted to an action distance of 0.2 | OpenAI Baselines' defaults |
 | network | 64-64 with ReLU, the action enters the critic's second layer | OpenAI Baselines' defaults |
-| cars side by side | 10, each with a perturbed actor of its own, drawn anew every 10 s | ours: ten steps for the price of two |
+| cars side by side | 10, each with a perturbed actor of its own, drawn anew every 10 s | ours; Baselines has one |
 | observations | as the task scales them | ours; Baselines also normalises by running statistics |
 
 The driving task stands in for TORCS with the wrapper of the study: the same 65 observations, two actions and rewards, a

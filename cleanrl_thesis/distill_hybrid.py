@@ -10,8 +10,8 @@ softmax at temperature T (soft labels) and against the human's actions (hard lab
 
 The teacher is a run of `dqn_apple.py --save-model`. The human is by default a **synthetic** one: a script with a
 reaction time, motor noise, keys that are held too long or too short, slips and lapses, calibrated to the mean of Table
-2.1's human row; it is made from no agent. `--demos` takes recordings instead. `--run-dir DIR --resume` can be sent again after
-every crash: on the same machine the run ends with the same bytes.
+2.1's human row; it is made from no agent. `--demos` takes recordings instead. `--run-dir DIR --resume` can be sent
+again after every crash: on the same machine the run ends with the same bytes.
 
 | setting | value | source |
 |---|---|---|

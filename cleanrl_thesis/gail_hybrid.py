@@ -10,8 +10,8 @@ The student π and the discriminator D play L_mix(π) = E_π[log D] + α E_RL[lo
 the environment never reaches the student.
 
 The expert's demonstrations are those of `ddpg_torcs_like.py --save-demos`, or of any script here. The human is by default
-a **synthetic** one: a script that looks at the road now and then, reacts late and steers inexactly, calibrated so that
-its score is to the expert's as 637 to 819 (Table 2.3); it is made from no agent. `--demos-human` takes recordings.
+a **synthetic** one: a script that looks at the road now and then, reacts late and steers inexactly; it is made from no
+agent, and not yet calibrated to Table 2.3, where it is to the expert as 637 to 819. `--demos-human` takes recordings.
 `--run-dir DIR --resume` can be sent again after every crash: on the same machine the run ends with the same bytes.
 
 | setting | value | source |
@@ -811,7 +811,7 @@ class SyntheticDriver:
 
     It looks at road and car now and then, and what it then decides reaches the hands a reaction time later. It steers for
     a point ahead of where the car will be by then, a little too much or too little, and corrects with the next look; it
-    slows down before curves and parked cars once they are in sight. Calibrated by benchmark/torcs_players.py.
+    slows down before curves and parked cars once they are in sight. Its numbers are guesses: it is not yet calibrated to Table 2.3.
     """
 
     look, look_spread = 9.0, 0.3  # median time between looks in steps of 0.02 s, and its deviation as a share
@@ -852,9 +852,8 @@ class SyntheticDriver:
         gaps = (np.array(PARKED) - place[:, None] + 8) % track.length - 8  # heeded until 8 m behind
         nearest = gaps.argmin(1)
         gap = gaps[np.arange(len(cars)), nearest]
-        return np.where(gap < np.maximum(60, 2.5 * speed), gap, np.inf), np.array(PARKED_LEFT)[
-            nearest
-        ] * track.half_width
+        left = np.array(PARKED_LEFT)[nearest] * track.half_width
+        return np.where(gap < np.maximum(60, 2.5 * speed), gap, np.inf), left
 
     def steering(self, cars: np.ndarray) -> np.ndarray:
         """Where the given drivers turn the wheel to, (n,) in [-1, 1]: towards a point ahead on the road."""
@@ -931,7 +930,7 @@ def read_demonstrations(folder: Path, args: Args, flag: str) -> list[dict[str, n
         raise UsageError(f"{flag} {folder}: holds no demonstrations, it has no readable manifest.json") from None
     require(version == 1, flag, folder, f"its manifest is of version {version}, this script reads version 1")
     require(bool(files), flag, folder, "holds no demonstrations, its manifest names no file")
-    same_task = recorded.split(":")[-1].split("/")[-1] == args.env_id.split(":")[-1].split("/")[-1]
+    same_task = recorded.split(":")[-1] == args.env_id.split(":")[-1]
     require(same_task, flag, folder, f"was recorded in {recorded}, --env-id is {args.env_id}")
     where = options.get("track", args.track_name)
     require(where == args.track_name, flag, folder, f"was recorded on {where}, --track-name is {args.track_name}")
@@ -954,6 +953,9 @@ class Demonstrations:
         rows = torch.randint(len(self.obs), (size,))
         return self.obs[rows], self.actions[rows]
 
+    def move(self, device: torch.device) -> None:
+        self.obs, self.actions = self.obs.to(device), self.actions.to(device)
+
 
 class Experts(NamedTuple):
     """Both experts; one that is not there, and so has no weight, is the other."""
@@ -964,15 +966,6 @@ class Experts(NamedTuple):
     def fingerprint(self) -> str:
         """SHA-256 of all that is learned from."""
         return self.rl.digest + self.human.digest
-
-    def to(self, device: torch.device) -> "Experts":
-        """The same, with their steps on a device."""
-        for demonstrations in self:
-            demonstrations.obs, demonstrations.actions = (
-                demonstrations.obs.to(device),
-                demonstrations.actions.to(device),
-            )
-        return self
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -1868,7 +1861,8 @@ def main(args: Args) -> int:
     agent = Agent(env.observation_space.shape[0], space.shape[0], args.hidden_size)
     agent.set_normalisation(torch.cat([demonstrations.obs for demonstrations in experts]))
     agent = agent.to(device)
-    experts = experts.to(device)
+    for demonstrations in experts:
+        demonstrations.move(device)
     policy = PolicyVector(agent)
     value_optimizer = torch.optim.Adam(agent.critic.parameters(), args.value_learning_rate)
     optimizer = torch.optim.Adam(agent.discriminator.parameters(), args.learning_rate)

@@ -1,5 +1,8 @@
 """What the tests share: small runs through the command line."""
 
+import hashlib
+import io
+import json
 import os
 import random
 import shutil
@@ -7,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -69,3 +73,42 @@ def small_run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("small")
     run(*SMALL, "--run-dir", "run", "--save-model", "--save-demos", 2, cwd=folder)
     return folder / "run"
+
+
+def assert_refused(module, capsys, flags: list, words: list[str]) -> None:
+    """Exit code 2, one line on stderr with the words, nothing on stdout."""
+    assert module.cli([str(flag) for flag in flags]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1 and err.startswith("error: "), err
+    for word in words:
+        assert word in err, err
+
+
+def rewrite(folder: Path, change) -> None:
+    """Change the arrays of the first demonstration and sign it anew."""
+    path = folder / "episode_00000.npz"
+    with np.load(path) as arrays:
+        changed = change(dict(arrays))
+    content = io.BytesIO()
+    np.savez(content, **changed)
+    path.write_bytes(content.getvalue())
+    sign(folder, path)
+
+
+def sign(folder: Path, path: Path) -> None:
+    """Put the checksum of a file into the manifest."""
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    edit_manifest(folder, lambda manifest: manifest["files"].update({path.name: digest}))
+
+
+def edit_manifest(folder: Path, change) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest)
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def flip_a_byte(folder: Path) -> None:
+    path = folder / "episode_00000.npz"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)

@@ -1,8 +1,6 @@
 """dqn_apple.py and distill_hybrid.py through the command line: runs, resumes, and what a user can get wrong."""
 
 import csv
-import hashlib
-import io
 import json
 import shutil
 import signal
@@ -16,7 +14,18 @@ import pytest
 import safetensors
 import safetensors.torch
 import torch
-from conftest import ROOT, command, kill_twice, needs_compiler, run
+from conftest import (
+    ROOT,
+    assert_refused,
+    command,
+    edit_manifest,
+    flip_a_byte,
+    kill_twice,
+    needs_compiler,
+    rewrite,
+    run,
+    sign,
+)
 
 from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_apple as dqn
@@ -271,15 +280,6 @@ def test_the_report_takes_whatever_is_done(teacher, student, tmp_path):
 
 
 # What a user can get wrong
-def assert_refused(module, capsys, flags: list, words: list[str]) -> None:
-    """Exit code 2, one line on stderr with the words, nothing on stdout."""
-    assert module.cli([str(flag) for flag in flags]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and err.startswith("error: "), err
-    for word in words:
-        assert word in err, err
-
-
 BAD_DQN = [
     (["--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "Discrete"]),
     (["--env-id", "NoSuchGame-v0"], ["NoSuchGame"]),
@@ -320,35 +320,6 @@ def test_a_wrong_value_is_one_line_and_creates_nothing(module, flags, words, tmp
     assert not list(tmp_path.iterdir())
 
 
-def rewrite(folder: Path, change) -> None:
-    """Change the arrays of the first demonstration and sign it anew."""
-    path = folder / "episode_00000.npz"
-    with np.load(path) as arrays:
-        changed = change(dict(arrays))
-    content = io.BytesIO()
-    np.savez(content, **changed)
-    path.write_bytes(content.getvalue())
-    sign(folder, path)
-
-
-def sign(folder: Path, path: Path) -> None:
-    manifest = json.loads((folder / "manifest.json").read_text())
-    manifest["files"][path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
-    (folder / "manifest.json").write_text(json.dumps(manifest))
-
-
-def edit_manifest(folder: Path, **changes) -> None:
-    manifest = json.loads((folder / "manifest.json").read_text())
-    (folder / "manifest.json").write_text(json.dumps({**manifest, **changes}))
-
-
-def flip_a_byte(folder: Path) -> None:
-    path = folder / "episode_00000.npz"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-
-
 def no_archive(folder: Path) -> None:
     (folder / "episode_00000.npz").write_bytes(b"no archive")
     sign(folder, folder / "episode_00000.npz")
@@ -367,9 +338,12 @@ def empty(folder: Path) -> None:
     "damage, words",
     [
         (empty, ["no readable manifest.json"]),
-        (lambda folder: edit_manifest(folder, files={}), ["names no file"]),
-        (lambda folder: edit_manifest(folder, version=2), ["version 2"]),
-        (lambda folder: edit_manifest(folder, env_id="ALE/Gopher-v5"), ["ALE/Gopher-v5", "AppleGame-v0"]),
+        (lambda folder: edit_manifest(folder, lambda m: m.update(files={})), ["names no file"]),
+        (lambda folder: edit_manifest(folder, lambda m: m.update(version=2)), ["version 2"]),
+        (
+            lambda folder: edit_manifest(folder, lambda m: m.update(env_id="ALE/Gopher-v5")),
+            ["ALE/Gopher-v5", "AppleGame-v0"],
+        ),
         (lambda folder: (folder / "episode_00000.npz").unlink(), ["episode_00000.npz", "cannot be read"]),
         (flip_a_byte, ["episode_00000.npz", "SHA-256"]),
         (no_archive, ["episode_00000.npz", "no demonstration"]),

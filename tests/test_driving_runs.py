@@ -1,7 +1,5 @@
 """ddpg_torcs_like.py and gail_hybrid.py through the command line: runs, resumes, and what a user can get wrong."""
 
-import hashlib
-import io
 import json
 import shutil
 import signal
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, command, kill_twice, needs_compiler, run
+from conftest import ROOT, assert_refused, command, edit_manifest, flip_a_byte, kill_twice, needs_compiler, rewrite, run
 
 from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import gail_hybrid as gail
@@ -184,15 +182,6 @@ def test_recorded_demonstrations_are_those_that_are_learned_from(student, expert
 
 
 # What a user can get wrong
-def assert_refused(module, capsys, flags: list, words: list[str]) -> None:
-    """Exit code 2, one line on stderr with the words, nothing on stdout."""
-    assert module.cli([str(flag) for flag in flags]) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and err.startswith("error: "), err
-    for word in words:
-        assert word in err, err
-
-
 BAD_DDPG = [
     (["--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "Box actions"]),
     (["--env-id", "NoSuchTask-v0"], ["NoSuchTask"]),
@@ -228,34 +217,6 @@ def test_a_wrong_value_is_one_line_and_creates_nothing(module, flags, words, tmp
     monkeypatch.chdir(tmp_path)
     assert_refused(module, capsys, flags, words)
     assert not list(tmp_path.iterdir())
-
-
-def rewrite(folder: Path, change) -> None:
-    """Change the arrays of the first demonstration and sign it anew."""
-    path = folder / "episode_00000.npz"
-    with np.load(path) as arrays:
-        changed = change(dict(arrays))
-    content = io.BytesIO()
-    np.savez(content, **changed)
-    path.write_bytes(content.getvalue())
-    edit_manifest(folder, lambda manifest: manifest["files"].update({path.name: digest(path)}))
-
-
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def edit_manifest(folder: Path, change) -> None:
-    manifest = json.loads((folder / "manifest.json").read_text())
-    change(manifest)
-    (folder / "manifest.json").write_text(json.dumps(manifest))
-
-
-def flip_a_byte(folder: Path) -> None:
-    path = folder / "episode_00000.npz"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
 
 
 @pytest.mark.parametrize(

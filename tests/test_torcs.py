@@ -32,6 +32,12 @@ def steer(cars: torcs.Cars, gain: float = 0.6) -> float:
     return float(np.clip((along + gain * cars.angle[0] - 0.03 * cars.left[0]) / torcs.STEERING_LOCK, -1, 1))
 
 
+def scattered(name: str, number: int) -> tuple[torcs.Track, np.ndarray, np.ndarray]:
+    """A road, and places on it: distance from the start line, and to the left of the middle."""
+    track, rng = torcs.Track(*torcs.TRACKS[name]), np.random.default_rng(0)
+    return track, rng.uniform(0, track.length, number), rng.uniform(-0.98, 0.98, number) * track.half_width
+
+
 # The road
 @pytest.mark.parametrize(
     "name, length, width, radius",
@@ -58,8 +64,7 @@ def test_tracks_close_and_have_the_sizes_of_torcs(name, length, width, radius):
 
 @pytest.mark.parametrize("name", torcs.TRACKS)
 def test_places_are_found_again(name):
-    track, rng = torcs.Track(*torcs.TRACKS[name]), np.random.default_rng(0)
-    distance, left = rng.uniform(0, track.length, 500), rng.uniform(-1, 1, 500) * track.half_width
+    track, distance, left = scattered(name, 500)
     segment, xy, _ = track.place(distance, left)
     along, found = track.locate(segment, xy)
     assert np.allclose(track.distances[segment] + along, distance) and np.allclose(found, left)
@@ -69,11 +74,10 @@ def test_places_are_found_again(name):
 
 @pytest.mark.parametrize("name", torcs.TRACKS)
 def test_range_finders_against_every_metre_of_the_edges(name):
-    track, rng = torcs.Track(*torcs.TRACKS[name]), np.random.default_rng(1)
-    distance, left = rng.uniform(0, track.length, 150), rng.uniform(-0.98, 0.98, 150) * track.half_width
+    track, distance, left = scattered(name, 150)
     segment, xy, heading = track.place(distance, left)
     along, _ = track.locate(segment, xy)
-    angles = rng.uniform(-np.pi, np.pi, (150, 3))
+    angles = np.random.default_rng(1).uniform(-np.pi, np.pi, (150, 3))
     places = segment, along.astype(np.float32), left.astype(np.float32)
     found = track.ranges(*places, np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32))
     finely = np.arange(0, track.length, 0.25)
