@@ -43,6 +43,8 @@ class Args:
     """folder for tables and figures"""
     likeness_episodes: int = 40
     """episodes of each agent and seed for the measure of human-likeness, half of them held out"""
+    note: str = ""
+    """a sentence put above the tables, on what the runs do not record themselves"""
 
 
 def read_runs(folder: Path) -> list[dict]:
@@ -451,7 +453,11 @@ def main(args: Args) -> None:
         "States and split": ablation_table(rows),
         "Human-likeness without people": likeness_table(method, args.runs, seeds, args.likeness_episodes),
     }
-    text = provenance(rows, seeds) + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
+    text = (
+        provenance(rows, seeds)
+        + (f"{args.note}\n\n" if args.note else "")
+        + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
+    )
     (args.out / "table.md").write_text(text)
     figure_2_4(rows, humans).savefig(args.out / "fig_2_4.png", dpi=130)
     print(text)
