@@ -13,11 +13,11 @@ after every crash: on the same machine the run ends with the same bytes.
 | steps, replay buffer | 10,000,000; 1,000,000 | section 2.4.3 |
 | learning rate of actor and critic | 1e-4, 1e-3 | OpenAI Baselines' defaults; section 2.4.3 names them the other way round |
 | γ, τ, batch, L2 of the critic, layer norm | 0.99, 0.01, 64, 1e-2, on | OpenAI Baselines' defaults |
+| observations | normalised by running statistics, clipped to 5 deviations of at least 0.1 | OpenAI Baselines' defaults |
 | updates | 50 after every 100 steps | OpenAI Baselines' defaults |
 | noise | on the parameters, adapted to an action distance of 0.2 | OpenAI Baselines' defaults |
 | network | 64-64 with ReLU, the action enters the critic's second layer | OpenAI Baselines' defaults |
 | cars side by side | 10, each with a perturbed actor of its own, drawn anew every 10 s | ours; Baselines has one |
-| observations | as the task scales them | ours; Baselines also normalises by running statistics |
 
 The driving task stands in for TORCS with the wrapper of the study: the same 65 observations, two actions and rewards, a
 car with the numbers of TORCS' car1-trb1, and roads of the same length, width and least radius as TORCS' tracks.
@@ -137,6 +137,8 @@ class Args:
     """units in each of the two hidden layers (Baselines)"""
     layer_norm: bool = True
     """normalise the hidden layers (Baselines)"""
+    normalize_obs: bool = True
+    """bring observations to mean 0 and deviation 1 by running statistics, clipped to 5 deviations (Baselines)"""
     buffer_size: int = 1_000_000
     """transitions in the replay buffer (section 2.4.3); 536 bytes each with TorcsLike-v0"""
     gamma: float = 0.99
@@ -813,12 +815,13 @@ class Critic(nn.Module):
 
 
 class Agent(nn.Module):
-    """Actor and critic."""
+    """Actor and critic, and mean and deviation of the observations that both are given normalised."""
 
     def __init__(self, obs_dim: int, action_dim: int, hidden_size: int, layer_norm: bool):
         super().__init__()
         self.actor = Actor(obs_dim, action_dim, hidden_size, layer_norm)
         self.critic = Critic(obs_dim, action_dim, hidden_size, layer_norm)
+        self.register_buffer("obs_scale", torch.tensor([[0.0], [1.0]]).repeat(1, obs_dim))
 
 
 def small_output(layer: nn.Linear) -> nn.Linear:
@@ -985,6 +988,44 @@ def make_players(args: Args) -> GymPlayers | CarPlayers:
     return GymPlayers([make_env(args.env_id) for _ in range(args.num_envs)], args.seed)
 
 
+class RunningNorm:
+    """Brings observations to mean 0 and deviation 1 by those of all that it has taken in, clipped to 5 (Baselines).
+
+    Without `is_on` it changes nothing.
+    """
+
+    least = 0.1  # of the deviation (Baselines)
+
+    def __init__(self, scale: torch.Tensor, is_on: bool):
+        """`scale` (2, O) keeps mean and deviation; it is changed in place."""
+        self.scale, self.is_on, self.limit = scale, is_on, 5.0 if is_on else math.inf
+        self.count, self.sums = 0, np.zeros(scale.shape)  # of observations and of their squares
+        self.mean, self.deviation = scale.cpu().numpy()
+
+    def update(self, obs: np.ndarray) -> None:
+        """Take in observations (N, O)."""
+        if not self.is_on:
+            return
+        self.count += len(obs)
+        self.sums += obs.sum(0), np.einsum("no,no->o", obs, obs, dtype=np.float64)
+        mean, square = self.sums / self.count
+        deviation = np.sqrt(np.maximum(square - mean * mean, self.least**2))
+        self.scale.copy_(torch.from_numpy(np.stack([mean, deviation])))
+        self.mean, self.deviation = self.scale.cpu().numpy()
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        """Observations (N, O) as the networks see them."""
+        return np.clip((obs - self.mean) / self.deviation, -self.limit, self.limit)
+
+    def state_dict(self) -> dict:
+        return {"count": self.count, "sums": torch.from_numpy(self.sums.copy()), "scale": self.scale}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.count, self.sums = state["count"], state["sums"].numpy().copy()
+        self.scale.copy_(state["scale"])
+        self.mean, self.deviation = self.scale.cpu().numpy()
+
+
 class ReplayBuffer:
     """The last `capacity` transitions, in a file that is written in place: a checkpoint keeps only how many there were.
 
@@ -1111,10 +1152,12 @@ class Minibatch(NamedTuple):
     next_obs: torch.Tensor  # (M, O)
 
     @classmethod
-    def unpack(cls, rows: torch.Tensor, obs_dim: int) -> "Minibatch":
-        """The transitions of the replay buffer's rows (M, 2 O + A + 2), as views."""
+    def unpack(cls, rows: torch.Tensor, scale: torch.Tensor, limit: float) -> "Minibatch":
+        """The transitions of the replay buffer's rows (M, 2 O + A + 2), observations as `RunningNorm` brings them."""
+        obs_dim = scale.shape[1]
         action_dim = rows.shape[1] - 2 * obs_dim - 2
         obs, actions, rewards, discounts, next_obs = rows.split([obs_dim, action_dim, 1, 1, obs_dim], 1)
+        obs, next_obs = (((part - scale[0]) / scale[1]).clamp(-limit, limit) for part in (obs, next_obs))
         return cls(obs, actions, rewards.squeeze(1), discounts.squeeze(1), next_obs)
 
 
@@ -1186,10 +1229,9 @@ def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float,
 class Update:
     """One step of Adam on one minibatch, for actor and critic at once, and one of the target networks."""
 
-    def __init__(self, agent: Agent, optimizer: FlatAdam, args: Args, example: torch.Tensor):
+    def __init__(self, agent: Agent, optimizer: FlatAdam, norm: RunningNorm, args: Args, example: torch.Tensor):
         """`example` are rows as they will come, (M, 2 O + A + 2)."""
-        self.agent, self.optimizer, self.args = agent, optimizer, args
-        self.obs_dim = agent.actor.first.in_features
+        self.agent, self.optimizer, self.norm, self.args = agent, optimizer, norm, args
         self.weights = [f"{name}.weight" for name in ("first", "second")]
         self.step, self.is_compiled = self.plain_step, False
         if args.compile:
@@ -1205,7 +1247,7 @@ class Update:
         try:
             torch.compiler.set_stance("default")
             with torch.no_grad():  # compiles, and changes nothing but copies
-                compiled(*(tensor.clone() for tensor in self.optimizer.state_dict().values()), example)
+                compiled(*(tensor.clone() for tensor in self.optimizer.state_dict().values()), self.norm.scale, example)
             torch.compiler.set_stance("default", skip_guard_eval_unsafe=True)  # every call is alike
             self.step, self.is_compiled = compiled, True
         except Exception as error:  # whatever the compiler's tool chain lacks, the plain step needs none of it
@@ -1234,8 +1276,8 @@ class Update:
         parts = critic_loss.detach(), actor_loss.detach(), values.mean().detach()
         return critic_loss + decay + actor_loss, parts
 
-    def plain_step(self, vector, target, mean, square, step, rows) -> tuple[torch.Tensor, ...]:
-        minibatch = Minibatch.unpack(rows, self.obs_dim)
+    def plain_step(self, vector, target, mean, square, step, scale, rows) -> tuple[torch.Tensor, ...]:
+        minibatch = Minibatch.unpack(rows, scale, self.norm.limit)
         targets = self.target_values(target, minibatch)
         gradient, parts = torch.func.grad(self.loss, has_aux=True)(vector, minibatch, targets)
         adam_step(vector, mean, square, step, self.optimizer.rates, gradient, math.inf, 1e-8)
@@ -1245,7 +1287,7 @@ class Update:
     def __call__(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Change the agent by the replay buffer's rows; return the losses of critic and actor and the mean Q."""
         with torch.no_grad():
-            return self.step(*self.optimizer.state_dict().values(), rows)
+            return self.step(*self.optimizer.state_dict().values(), self.norm.scale, rows)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -1504,10 +1546,10 @@ def record_video(policy, args: Args, run_dir: Path, seed: int) -> None:
     env.close()
 
 
-def make_policy(optimizer: FlatAdam, space: gym.spaces.Box):
+def make_policy(optimizer: FlatAdam, norm: RunningNorm, space: gym.spaces.Box):
     """The actor without noise as a function from observations (N, O) to the environment's actions (N, A)."""
     parameters = optimizer.actor_arrays(optimizer.actor_vector())
-    return lambda obs: scaled(numpy_actions(parameters, obs.astype(np.float32)), space)
+    return lambda obs: scaled(numpy_actions(parameters, norm(obs.astype(np.float32))), space)
 
 
 def scaled(actions: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
@@ -1686,6 +1728,7 @@ def main(args: Args) -> int:
     obs_dim, action_dim = env.observation_space.shape[0], env.action_space.shape[0]
     agent = Agent(obs_dim, action_dim, args.hidden_size, args.layer_norm).to(device)
     optimizer = FlatAdam(agent, args)
+    norm = RunningNorm(agent.obs_scale, args.normalize_obs)
     players = make_players(args)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
     explorer = (ParameterNoise if args.noise == "parameter" else ActionNoise)(optimizer, args, action_dim, rng)
@@ -1704,12 +1747,13 @@ def main(args: Args) -> int:
         iteration, updates, distance = checkpoint["iteration"], checkpoint["updates"], checkpoint["distance"]
         training_seconds, offsets = checkpoint["training_seconds"], checkpoint["offsets"]
         optimizer.load_state_dict(checkpoint["optimizer"])
+        norm.load_state_dict(checkpoint["norm"])
         explorer.load_state_dict(checkpoint["explorer"])
         rng.bit_generator.state = json.loads(checkpoint["rng"])
         vars(means).update(checkpoint["means"])
         if not players.load_state_dict(checkpoint["players"]):
             print("--resume: the replayed episode differs (another machine?), goes on with it", file=sys.stderr)
-    update = Update(agent, optimizer, args, optimizer.vector.new_zeros(args.batch_size, width))
+    update = Update(agent, optimizer, norm, args, optimizer.vector.new_zeros(args.batch_size, width))
     arithmetic = f"{'compiled' if update.is_compiled else 'plain'} on {device.type}"
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
@@ -1728,7 +1772,8 @@ def main(args: Args) -> int:
         before = global_step
         for _ in range(args.rollout_steps // args.num_envs):
             obs = players.obs.copy()
-            actions = explorer.act(obs)
+            norm.update(obs)
+            actions = explorer.act(norm(obs))
             steps = players.step(scaled(actions, env.action_space))
             discounts = args.gamma * ~steps.terminated
             buffer.add(obs, actions, args.reward_scale * steps.rewards, discounts, steps.next_obs)
@@ -1747,7 +1792,7 @@ def main(args: Args) -> int:
 
         for _ in range(args.train_steps if buffer.added >= args.batch_size else 0):
             if updates % args.adapt_interval == 0:
-                distance = explorer.adapt(buffer.sample(args.batch_size, rng).numpy()[:, :obs_dim])
+                distance = explorer.adapt(norm(buffer.sample(args.batch_size, rng).numpy()[:, :obs_dim]))
             means.add(update(buffer.sample(args.batch_size, rng).to(device)))
             updates += 1
 
@@ -1774,6 +1819,7 @@ def main(args: Args) -> int:
                 "training_seconds": training_seconds,
                 "offsets": {"episodes": episodes_csv.sync(), "updates": updates_csv.sync()},
                 "optimizer": optimizer.state_dict(),
+                "norm": norm.state_dict(),
                 "explorer": explorer.state_dict(),
                 "added": buffer.sync(),
                 "rng": json.dumps(rng.bit_generator.state),
@@ -1790,7 +1836,7 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    finish_run(agent, make_policy(optimizer, env.action_space), args, run_dir, global_step, training_seconds, writer)
+    finish_run(agent, make_policy(optimizer, norm, env.action_space), args, run_dir, global_step, training_seconds, writer)
     writer.close()
     return 0
 

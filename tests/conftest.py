@@ -1,6 +1,9 @@
 """What the tests share: small runs through the command line."""
 
+import contextlib
+import fcntl
 import hashlib
+import importlib
 import io
 import json
 import os
@@ -8,6 +11,8 @@ import random
 import shutil
 import subprocess
 import sys
+import threading
+import unittest.mock
 from pathlib import Path
 
 import numpy as np
@@ -32,11 +37,32 @@ def command(*flags: object, script: Path = SCRIPT) -> list[str]:
 def run(
     *flags: object, cwd: Path, code: int = 0, script: Path = SCRIPT, **environment: str
 ) -> subprocess.CompletedProcess:
-    """Run the script to its end and check its exit code."""
-    env = {**os.environ, **environment}
-    done = subprocess.run(command(*flags, script=script), cwd=cwd, env=env, capture_output=True, text=True, timeout=600)
+    """Run a script to its end and check its exit code.
+
+    It runs within this process, for to start Python and PyTorch takes seconds; in one of its own where the script is a
+    copy, is compiled, or needs environment variables, and beside others.
+    """
+    is_copy = script.parent != ROOT / "cleanrl_thesis"
+    if is_copy or environment or "--compile" in flags or threading.current_thread() is not threading.main_thread():
+        env, streams = {**os.environ, **environment}, {"capture_output": True, "text": True}
+        done = subprocess.run(command(*flags, script=script), cwd=cwd, env=env, timeout=600, **streams)
+    else:
+        cli, out, err = importlib.import_module(f"cleanrl_thesis.{script.stem}").cli, io.StringIO(), io.StringIO()
+        streams = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
+        with contextlib.chdir(cwd), streams[0], streams[1], unlocked_at_the_end():
+            returned = cli([str(flag) for flag in flags])
+        done = subprocess.CompletedProcess(flags, returned, out.getvalue(), err.getvalue())
     assert done.returncode == code, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
     return done
+
+
+@contextlib.contextmanager
+def unlocked_at_the_end():
+    """Let go of the run folders that are locked in here; a script leaves that to the end of its process."""
+    with unittest.mock.patch.object(fcntl, "flock", side_effect=fcntl.flock) as flock:
+        yield
+    for call in flock.call_args_list:
+        os.close(call.args[0])
 
 
 def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:

@@ -23,7 +23,9 @@ def make(**flags):
     optimizer.target.add_(0.1 * torch.randn_like(optimizer.target))
     rows = torch.randn(32, 2 * OBS + ACTIONS + 2)
     rows[:, OBS + ACTIONS + 1] = 0.99 * (torch.rand(32) < 0.8)
-    return args, agent, optimizer, ddpg.Update(agent, optimizer, args, rows), rows
+    norm = ddpg.RunningNorm(agent.obs_scale, args.normalize_obs)
+    norm.update(np.random.default_rng(0).normal(1, 2, (50, OBS)).astype(np.float32))
+    return args, agent, optimizer, ddpg.Update(agent, optimizer, norm, args, rows), rows
 
 
 def peer_networks(agent, optimizer):
@@ -45,6 +47,7 @@ def test_an_update_is_that_of_two_torch_optimisers(layer_norm):
     for _ in range(5):
         parts = update(rows)
         obs, actions, rewards, discounts, next_obs = rows.split([OBS, ACTIONS, 1, 1, OBS], 1)
+        obs, next_obs = (((part - agent.obs_scale[0]) / agent.obs_scale[1]).clip(-5, 5) for part in (obs, next_obs))
         with torch.no_grad():
             goal = rewards[:, 0] + discounts[:, 0] * target.critic(next_obs, target.actor(next_obs))
         error = ((peer.critic(obs, actions) - goal) ** 2).mean()
@@ -64,6 +67,24 @@ def test_an_update_is_that_of_two_torch_optimisers(layer_norm):
     for ours, theirs in ((optimizer.vector, peer), (optimizer.target, target)):
         flat = torch.cat([parameter.detach().reshape(-1) for parameter in theirs.parameters()])
         assert torch.allclose(ours, flat, atol=5e-6)
+
+
+def test_observations_are_normalised_by_all_that_came():
+    """As numpy's mean and deviation, at least 0.1 of it, clipped to 5; restored; and left alone without --normalize-obs."""
+    obs = np.random.default_rng(0).normal(3, [2, 0.5, 0.01], (1_000, 3)).astype(np.float32)
+    norm = ddpg.RunningNorm(torch.tensor([[0.0] * 3, [1.0] * 3]), True)
+    for part in np.split(obs, 100):
+        norm.update(part)
+    expected = (obs - obs.mean(0)) / np.maximum(obs.std(0), 0.1)
+    assert np.allclose(norm(obs), expected, atol=1e-4) and np.abs(norm(obs + 100)).max() == 5
+    again = ddpg.RunningNorm(torch.zeros(2, 3), True)
+    again.load_state_dict(norm.state_dict())
+    for each in (norm, again):
+        each.update(obs[:7])
+    assert np.array_equal(again(obs), norm(obs)) and torch.equal(again.scale, norm.scale)
+    off = ddpg.RunningNorm(torch.tensor([[0.0] * 3, [1.0] * 3]), False)
+    off.update(obs)
+    assert np.array_equal(off(obs), obs)
 
 
 @needs_compiler

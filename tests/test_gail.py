@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse.linalg
 import torch
+from sb3_contrib import TRPO
 
 from cleanrl_thesis import gail_hybrid as gail
 
@@ -199,3 +200,37 @@ def test_demonstrations_are_normalised_and_within_bounds():
     for row, action in zip(obs, actions):
         i = (demonstrations.obs == row).all(1).nonzero()[0, 0]
         assert torch.equal(demonstrations.actions[i], action)
+
+
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Hopper-v5"])
+def test_a_step_of_trpo_is_sb3_contrib_s(env_id, monkeypatch):
+    """From the same weights, on the same 2,048 steps, both move the policy's parameters by the same vector.
+
+    Theirs averages the KL divergence over the A dimensions of the actions, where TRPO's sums: its bound and its damping
+    are ours divided by A.
+    """
+    theirs = TRPO("MlpPolicy", gym.make(env_id), seed=1, device="cpu")
+    theirs.learn(2_048)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(theirs, "train", lambda: None)
+        theirs.learn(2_048, reset_num_timesteps=False)
+    steps, policy_net = next(theirs.rollout_buffer.get()), theirs.policy.mlp_extractor.policy_net
+    obs_dim, action_dim = theirs.observation_space.shape[0], theirs.action_space.shape[0]
+    agent = gail.Agent(obs_dim, action_dim, 64)
+    for ours, layer in zip(agent.actor_mean[::2], (policy_net[0], policy_net[2], theirs.policy.action_net)):
+        ours.load_state_dict(layer.state_dict())
+    agent.actor_logstd.data = theirs.policy.log_std.detach().clone()
+    policy = gail.PolicyVector(agent)
+    old = policy.vector.clone()
+    advantages = (steps.advantages - steps.advantages.mean()) / (steps.advantages.std() + 1e-8)
+    batch = gail.Batch(steps.observations.float(), steps.actions, steps.actions, advantages, steps.returns)
+    same = {"cg_iterations": theirs.cg_max_steps, "cg_damping": theirs.cg_damping, "max_kl": theirs.target_kl}
+    same |= {name: action_dim * same[name] for name in ("cg_damping", "max_kl")}
+    metrics = gail.trpo_step(policy, batch, gail.Args(alpha=0.0, **same))
+    assert metrics["charts/halvings"] == 0
+
+    monkeypatch.setattr(torch, "randn_like", torch.zeros_like)  # theirs begins the search at a small random vector
+    theirs.train()
+    parameters = [*policy_net.parameters(), *theirs.policy.action_net.parameters(), theirs.policy.log_std]
+    found = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
+    assert (found - policy.vector).norm() < 1e-3 * (found - old).norm()
