@@ -2,7 +2,7 @@
 
     python cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220      # the expert, for gail_hybrid.py
     python cleanrl_thesis/ddpg_torcs_like.py --track hills --noise ou
-    python cleanrl_thesis/ddpg_torcs_like.py --env-id Pendulum-v1 --total-timesteps 50000 --num-envs 1 --reward-scale 0.1
+    python cleanrl_thesis/ddpg_torcs_like.py --env-id Pendulum-v1 --total-timesteps 50000 --num-envs 1 --frame-skip 1
 
 Tasks: the simulator, which is built in (`gymnasium.make("cleanrl_thesis.ddpg_torcs_like:TorcsLike-v0")`), and any
 Gymnasium environment with flat `Box` observations and bounded `Box` actions. `--run-dir DIR --resume` can be sent again
@@ -17,6 +17,7 @@ after every crash: on the same machine the run ends with the same bytes.
 | updates | 50 after every 100 steps | OpenAI Baselines' defaults |
 | noise | on the parameters, adapted to an action distance of 0.2 | OpenAI Baselines' defaults |
 | network | 64-64 with ReLU, the action enters the critic's second layer | OpenAI Baselines' defaults |
+| an action | held for 5 steps, 0.1 s; the reward is scaled by 0.1 | ours; Baselines has 1 and 1 |
 | cars side by side | 10, each with a perturbed actor of its own, drawn anew every 10 s | ours; Baselines has one |
 
 The driving task stands in for TORCS with the wrapper of the study: the same 65 observations, two actions and rewards, a
@@ -127,6 +128,8 @@ class Args:
     """environment steps (section 2.4.3)"""
     num_envs: int = 10
     """environments side by side"""
+    frame_skip: int = 5
+    """steps for which an action is held; all other numbers of steps count each of them"""
     actor_learning_rate: float = 1e-4
     """Adam's learning rate for the actor (Baselines)"""
     learning_rate: float = 1e-3
@@ -151,8 +154,8 @@ class Args:
     """environment steps between updates (Baselines)"""
     train_steps: int = 50
     """updates after them (Baselines)"""
-    reward_scale: float = 1.0
-    """factor of the reward in training (Baselines)"""
+    reward_scale: float = 0.1
+    """factor of the reward in training"""
     noise: Literal["parameter", "ou", "gaussian", "none"] = "parameter"
     """noise on the actor's parameters, or on its actions: Ornstein-Uhlenbeck or Gaussian"""
     noise_std: float = 0.2
@@ -202,7 +205,9 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
-    counts = "num_threads num_envs batch_size buffer_size eval_episodes checkpoint_interval stop_at hidden_size"
+    counts = (
+        "num_threads num_envs frame_skip batch_size buffer_size eval_episodes checkpoint_interval stop_at hidden_size"
+    )
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("rollout_steps perturb_interval adapt_interval", lambda x: x >= 1, "must be at least 1"),
@@ -217,8 +222,9 @@ def complete_args(args: Args) -> Args:
             require(holds(getattr(args, name)), f"--{name.replace('_', '-')}", getattr(args, name), allowed)
     require(not args.resume or args.run_dir is not None, "--resume", "", "needs --run-dir, the folder to go on in")
     require(args.track_name in TRACKS, "--track-name", args.track_name, f"must be one of {', '.join(TRACKS)}")
-    whole = args.rollout_steps % args.num_envs == 0
-    require(whole, "--rollout-steps", args.rollout_steps, f"must be a multiple of --num-envs, {args.num_envs}")
+    at_once = args.num_envs * args.frame_skip
+    whole = args.rollout_steps % at_once == 0
+    require(whole, "--rollout-steps", args.rollout_steps, f"must be a multiple of --num-envs · --frame-skip, {at_once}")
     args.num_iterations = args.total_timesteps // args.rollout_steps
     allowed = f"must be at least --rollout-steps, {args.rollout_steps}"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
@@ -981,6 +987,38 @@ class CarPlayers:
         return np.array_equal(self.games.cars.observe(self.games.all_cars), self.obs)
 
 
+def step_and_hold(players: GymPlayers | CarPlayers, actions: np.ndarray, frame_skip: int) -> Steps:
+    """Hold actions (N, A) for `frame_skip` steps, with the sums of rewards until an episode's end.
+
+    An episode that begins on the way is driven by the same action, and its steps until then are not learned from.
+    """
+    first = players.step(actions)
+    next_obs, rewards, terminated, ended = first.next_obs.copy(), first.rewards.copy(), first.terminated, first.ended
+    for _ in range(frame_skip - 1):
+        goes_on = np.ones(len(actions), bool)
+        goes_on[[i for i, _, _ in ended]] = False
+        after = players.step(actions)
+        next_obs[goes_on] = after.next_obs[goes_on]
+        rewards += goes_on * after.rewards
+        terminated = terminated | goes_on & after.terminated
+        ended = ended + after.ended
+    return Steps(next_obs, rewards, terminated, ended)
+
+
+def held(policy, frame_skip: int):
+    """A policy that acts anew every `frame_skip` steps, from the first on."""
+    steps, actions = 0, None
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        nonlocal steps, actions
+        if steps % frame_skip == 0:
+            actions = policy(obs)
+        steps += 1
+        return actions
+
+    return act
+
+
 def make_players(args: Args) -> GymPlayers | CarPlayers:
     """The environments to train in."""
     if is_driving(args.env_id):
@@ -1560,10 +1598,10 @@ def scaled(actions: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
 def evaluate(policy, args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes that training never saw; write `evaluation.json` and, if asked, a video."""
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
-    episodes = play(policy, make_games(args, len(seeds)), seeds)
+    episodes = play(held(policy, args.frame_skip), make_games(args, len(seeds)), seeds)
     returns = [float(episode["rewards"].sum()) for episode in episodes]
     if args.capture_video:
-        record_video(policy, args, run_dir, seeds[0])
+        record_video(held(policy, args.frame_skip), args, run_dir, seeds[0])
     evaluation = {
         "env_id": args.env_id,
         "mode": "without noise",
@@ -1587,7 +1625,7 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 def save_demonstrations(policy, args: Args, run_dir: Path) -> None:
     """Write `--save-demos` episodes of the actor without noise into `demos/`."""
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
-    episodes = play(policy, make_games(args, len(seeds)), seeds, keep=True)
+    episodes = play(held(policy, args.frame_skip), make_games(args, len(seeds)), seeds, keep=True)
     about = {"env_id": args.env_id, "options": env_options(args), "player": args.exp_name, "mode": "without noise"}
     write_demonstrations(run_dir / "demos", episodes, about)
 
@@ -1736,6 +1774,8 @@ def main(args: Args) -> int:
     added, width = 0 if checkpoint is None else checkpoint["added"], 2 * obs_dim + action_dim + 2
     is_trained = checkpoint is not None and checkpoint["iteration"] >= last_iteration  # only its end is done again
     buffer = None if is_trained else ReplayBuffer(run_dir / "replay.dat", args.buffer_size, spare, width, added)
+    at_once = args.num_envs * args.frame_skip
+    perturb_interval = max(1, args.perturb_interval // args.frame_skip)
     means = Means()
     iteration, updates, training_seconds, offsets = 0, 0, 0.0, {"episodes": 0, "updates": 0}
     distance = math.nan
@@ -1770,14 +1810,14 @@ def main(args: Args) -> int:
     while iteration < last_iteration:
         iteration += 1
         before = global_step
-        for _ in range(args.rollout_steps // args.num_envs):
+        for _ in range(args.rollout_steps // at_once):
             obs = players.obs.copy()
             norm.update(obs)
             actions = explorer.act(norm(obs))
-            steps = players.step(scaled(actions, env.action_space))
+            steps = step_and_hold(players, scaled(actions, env.action_space), args.frame_skip)
             discounts = args.gamma * ~steps.terminated
             buffer.add(obs, actions, args.reward_scale * steps.rewards, discounts, steps.next_obs)
-            global_step += args.num_envs
+            global_step += at_once
             for i, episodic_return, length in steps.ended:
                 explorer.begin(i)
                 episodes_csv.write(
@@ -1786,7 +1826,7 @@ def main(args: Args) -> int:
                 charts = {"charts/episodic_return": episodic_return, "charts/episodic_length": length}
                 add_scalars(writer, charts, global_step)
                 progress.set_postfix_str(f"return {episodic_return:.1f}", refresh=False)
-            if global_step // args.num_envs % args.perturb_interval == 0:
+            if (global_step // at_once) % perturb_interval == 0:
                 for i in range(args.num_envs):
                     explorer.begin(i)
 
@@ -1836,7 +1876,9 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    finish_run(agent, make_policy(optimizer, norm, env.action_space), args, run_dir, global_step, training_seconds, writer)
+    finish_run(
+        agent, make_policy(optimizer, norm, env.action_space), args, run_dir, global_step, training_seconds, writer
+    )
     writer.close()
     return 0
 

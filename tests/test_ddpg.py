@@ -253,3 +253,21 @@ def test_actions_are_scaled_to_the_bounds():
     space = gym.spaces.Box(np.array([-2, 0], np.float32), np.array([2, 1], np.float32))
     scaled = ddpg.scaled(np.array([[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0]]), space)
     assert scaled.tolist() == [[-2, 0], [0, 0.5], [2, 1]]
+
+
+def test_an_action_is_held_until_its_end_or_the_episode_s():
+    """Rewards are summed up to the end of the episode; what the next one does with the rest of the action is left out."""
+    players = ddpg.GymPlayers([Counter(), Counter()], seed=0)
+    players.start()
+    players.step(np.zeros((2, 1)))
+    steps = ddpg.step_and_hold(players, np.zeros((2, 1)), 2)
+    assert (steps.next_obs[:, 0].tolist(), steps.rewards.tolist(), steps.ended) == ([3, 3], [2, 2], [])
+    steps = ddpg.step_and_hold(players, np.zeros((2, 1)), 3)
+    assert steps.next_obs[:, 0].tolist() == [4, 4] and steps.rewards.tolist() == [1, 1]
+    assert steps.terminated.tolist() == [True, True] and [i for i, _, _ in steps.ended] == [0, 1]
+    assert players.obs[:, 0].tolist() == [2, 2]
+
+
+def test_a_held_policy_acts_anew_every_few_steps():
+    act = ddpg.held(lambda obs: obs.copy(), 3)
+    assert [act(np.array([t])).item() for t in range(7)] == [0, 0, 0, 3, 3, 3, 6]
