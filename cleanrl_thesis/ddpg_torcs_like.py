@@ -18,7 +18,7 @@ after every crash: on the same machine the run ends with the same bytes.
 | noise | on the parameters, adapted to an action distance of 0.2 | OpenAI Baselines' defaults |
 | network | 64-64 with ReLU, the action enters the critic's second layer | OpenAI Baselines' defaults |
 | an action | held for 5 steps, 0.1 s; the reward is scaled by 0.1 | ours; Baselines has 1 and 1 |
-| cars side by side | 10, each with a perturbed actor of its own, drawn anew every 10 s | ours; Baselines has one |
+| cars side by side | 10, each with a perturbed actor of its own, drawn anew every 10 s; from all of the noise for the first to none for the last | ours; Baselines has one |
 
 The driving task stands in for TORCS with the wrapper of the study: the same 65 observations, two actions and rewards, a
 car with the numbers of TORCS' car1-trb1, and roads of the same length, width and least radius as TORCS' tracks.
@@ -160,6 +160,8 @@ class Args:
     """noise on the actor's parameters, or on its actions: Ornstein-Uhlenbeck or Gaussian"""
     noise_std: float = 0.2
     """standard deviation of the noise on actions; for noise on the parameters the distance of actions aimed at"""
+    noise_ladder: bool = True
+    """the first environment has all of the noise, the last none, those between shares of it; off: each has all"""
     perturb_interval: int = 500
     """steps of an environment after which its perturbed actor is drawn anew, as at the start of each episode"""
     adapt_interval: int = 50
@@ -1103,6 +1105,11 @@ class ReplayBuffer:
         return self.added
 
 
+def noise_shares(args: Args) -> np.ndarray:
+    """How much of the noise each environment has, (N,)."""
+    return np.linspace(1, 0, args.num_envs) if args.noise_ladder else np.ones(args.num_envs)
+
+
 class ParameterNoise:
     """An actor for each environment with noise on its parameters (Plappert et al., 2018), but for those of the norms.
 
@@ -1114,18 +1121,18 @@ class ParameterNoise:
         names = optimizer.actor_names
         sizes = [shape.numel() for shape in optimizer.shapes[: len(names)]]
         has_noise = np.concatenate([np.full(size, "norm" not in name) for name, size in zip(names, sizes)])
-        self.mask = has_noise.astype(np.float32)
+        self.mask, self.shares = has_noise.astype(np.float32), noise_shares(args)
         self.vectors = np.zeros((args.num_envs, len(self.mask)), np.float32)
         self.actors = optimizer.actor_arrays(self.vectors)
 
-    def draw(self) -> np.ndarray:
-        """The actor's parameters with noise, (P,)."""
+    def draw(self, share: float = 1.0) -> np.ndarray:
+        """The actor's parameters with a share of the noise, (P,)."""
         noise = self.rng.standard_normal(len(self.mask), np.float32)
-        return self.optimizer.actor_vector() + np.float32(self.size) * self.mask * noise
+        return self.optimizer.actor_vector() + np.float32(share * self.size) * self.mask * noise
 
     def begin(self, i: int) -> None:
         """Perturb the actor of an environment anew."""
-        self.vectors[i] = self.draw()
+        self.vectors[i] = self.draw(self.shares[i])
 
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Observations (N, O) -> actions (N, A)."""
@@ -1153,6 +1160,7 @@ class ActionNoise:
     def __init__(self, optimizer: "FlatAdam", args: Args, action_dim: int, rng: np.random.Generator):
         self.optimizer, self.rng, self.kind = optimizer, rng, args.noise
         self.size = 0.0 if args.noise == "none" else args.noise_std
+        self.shares = noise_shares(args)[:, None]
         self.noise = np.zeros((args.num_envs, action_dim))
 
     def begin(self, i: int) -> None:
@@ -1164,7 +1172,7 @@ class ActionNoise:
         draws = self.size * self.rng.standard_normal(self.noise.shape)
         self.noise = self.noise * (1 - 0.15 * 0.01) + 0.1 * draws if self.kind == "ou" else draws
         actions = numpy_actions(self.optimizer.actor_arrays(self.optimizer.actor_vector()), obs)
-        return np.clip(actions + self.noise, -1, 1).astype(np.float32)
+        return np.clip(actions + self.shares * self.noise, -1, 1).astype(np.float32)
 
     def adapt(self, obs: np.ndarray) -> float:
         """Nothing to adapt."""

@@ -1262,22 +1262,29 @@ class Batch(NamedTuple):
     returns: torch.Tensor  # (B,)
 
 
-def make_batch(agent: Agent, rollout: Rollout, space: gym.spaces.Box, args: Args, device) -> tuple[Batch, dict]:
-    """Pay the student by the discriminator, and estimate values and advantages."""
-    tensors = (torch.from_numpy(array).to(device).flatten(0, 1) for array in (rollout.obs, rollout.next_obs))
-    with torch.no_grad():
-        obs, next_obs = (agent.normalise(tensor) for tensor in tensors)
-        actions = torch.from_numpy(rollout.actions).to(device).flatten(0, 1)
-        seen = torch.from_numpy(bounded(rollout.actions, space.low, space.high)).to(device).flatten(0, 1)
-        logits = agent.logits(obs, seen)
-        shape = rollout.terminated.shape
-        columns = imitation_reward(logits, args.reward_form), agent.value(obs), agent.value(next_obs)
-        rewards, values, next_values = (column.cpu().numpy().reshape(shape) for column in columns)
+def flat_tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
+    """(T, N, ...) -> (T · N, ...)"""
+    return torch.from_numpy(array).to(device).flatten(0, 1)
+
+
+@torch.no_grad()
+def pay(agent: Agent, rollout: Rollout, space: gym.spaces.Box, form: str, device: torch.device) -> np.ndarray:
+    """The student's rewards by the discriminator, (T, N)."""
+    seen = bounded(rollout.actions, space.low, space.high)
+    logits = agent.logits(agent.normalise(flat_tensor(rollout.obs, device)), flat_tensor(seen, device))
+    return imitation_reward(logits, form).cpu().numpy().reshape(rollout.ended.shape)
+
+
+@torch.no_grad()
+def make_batch(agent: Agent, rollout: Rollout, rewards: np.ndarray, space: gym.spaces.Box, args: Args, device) -> Batch:
+    """Estimate values and advantages for rewards (T, N)."""
+    obs, next_obs = (agent.normalise(flat_tensor(array, device)) for array in (rollout.obs, rollout.next_obs))
+    values, next_values = (agent.value(x).cpu().numpy().reshape(rewards.shape) for x in (obs, next_obs))
     advantages = gae(rewards, values, next_values, rollout.terminated, rollout.ended, args.gamma, args.gae_lambda)
-    b_advantages = torch.from_numpy(advantages.reshape(-1)).to(device)
-    returns = b_advantages + torch.from_numpy(values.reshape(-1)).to(device)
-    b_advantages = (b_advantages - b_advantages.mean()) / (b_advantages.std() + 1e-8)
-    return Batch(obs, actions, seen, b_advantages, returns), {"charts/imitation_reward": float(rewards.mean())}
+    returns = flat_tensor(advantages + values, device)
+    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    actions, seen = rollout.actions, bounded(rollout.actions, space.low, space.high)
+    return Batch(obs, flat_tensor(actions, device), flat_tensor(seen, device), flat_tensor(advantages, device), returns)
 
 
 def conjugate_gradient(multiply, b: torch.Tensor, iterations: int, tolerance: float = 1e-10) -> torch.Tensor:
@@ -1901,8 +1908,9 @@ def main(args: Args) -> int:
     while iteration < last_iteration:
         iteration += 1
         rollout = collect(agent, players, space, args.num_steps, rng)
-        batch, metrics = make_batch(agent, rollout, space, args, device)
-        metrics |= trpo_step(policy, batch, args)
+        rewards = pay(agent, rollout, space, args.reward_form, device)
+        batch = make_batch(agent, rollout, rewards, space, args, device)
+        metrics = {"charts/imitation_reward": float(rewards.mean()), **trpo_step(policy, batch, args)}
         metrics["losses/value_loss"] = update_values(agent, value_optimizer, batch, args)
         metrics["charts/policy_std"] = agent.actor_logstd.exp().mean().item()
         if iteration % args.g_steps == 0:

@@ -136,7 +136,7 @@ def test_the_size_of_the_noise_goes_to_where_actions_are_as_far_as_asked():
 
 
 def test_each_environment_has_a_perturbed_actor_of_its_own():
-    args, _, optimizer, *_ = make()
+    args, _, optimizer, *_ = make(noise_ladder=False)
     noise = ddpg.ParameterNoise(optimizer, args, ACTIONS, np.random.default_rng(0))
     for i in range(3):
         noise.begin(i)
@@ -147,10 +147,28 @@ def test_each_environment_has_a_perturbed_actor_of_its_own():
     assert (noise.act(obs) == first).all(1).tolist() == [True, False, True]
 
 
+@pytest.mark.parametrize("kind", ["parameter", "gaussian"])
+def test_the_noise_falls_from_the_first_environment_to_the_last(kind):
+    args, agent, optimizer, *_ = make(noise=kind, num_envs=5)
+    with torch.no_grad():
+        agent.actor.output.weight.mul_(10)
+    explorer = ddpg.ParameterNoise if kind == "parameter" else ddpg.ActionNoise
+    noise = explorer(optimizer, args, ACTIONS, np.random.default_rng(0))
+    obs = np.ones((5, OBS), np.float32)
+    ways = []
+    for _ in range(300):
+        for i in range(5):
+            noise.begin(i)
+        ways.append(noise.act(obs) - ddpg.numpy_actions(optimizer.actor_arrays(optimizer.actor_vector()), obs))
+    sizes = np.square(ways).mean((0, 2)) ** 0.5
+    assert (np.diff(sizes) < 0).all() and sizes[-1] < 1e-6
+    assert ddpg.noise_shares(ddpg.Args(num_envs=1)).tolist() == [1]
+
+
 @pytest.mark.parametrize("kind", ["gaussian", "ou", "none"])
 def test_noise_on_actions(kind):
     """Deviations: of a Gaussian as given; of the Ornstein-Uhlenbeck process 0.1 σ / √(1 − (1 − 0.0015)²)."""
-    args, _, optimizer, *_ = make(noise=kind)
+    args, _, optimizer, *_ = make(noise=kind, noise_ladder=False)
     noise = ddpg.ActionNoise(optimizer, args, ACTIONS, np.random.default_rng(0))
     obs = np.zeros((3, OBS), np.float32)
     actions = np.stack([noise.act(obs) for _ in range(20_000)])
