@@ -168,7 +168,8 @@ class Args:
     reward_form: Literal["positive", "signed"] = "positive"
     """positive: −log D (Eq. 2.3.1), with which it pays to survive; signed: log(1 − D) − log D, with which it need not"""
     bc_epochs: int = 0
-    """passes over the demonstrations in which the policy first learns their actions (behaviour cloning)"""
+    """passes over the human's demonstrations in which the policy first learns actions (behaviour cloning); with
+    `--total-timesteps 0` that is all: both experts' actions are mixed into one mean, as section 2.3.2 warns against"""
     hidden_size: int = 100
     """units in each of the two hidden layers of all networks"""
 
@@ -216,7 +217,7 @@ def complete_args(args: Args) -> Args:
     is_gail = args.alpha == 0
     if args.total_timesteps is None:
         args.total_timesteps = 5_000_000 if is_gail else 7_500_000
-    args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
+    args.stop_at = max(1, args.total_timesteps) if args.stop_at is None else args.stop_at
     counts = "num_threads num_envs eval_episodes checkpoint_interval stop_at human_episodes hidden_size"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
@@ -245,8 +246,9 @@ def complete_args(args: Args) -> Args:
     )
     args.batch_size = args.num_envs * args.num_steps
     args.num_iterations = args.total_timesteps // args.batch_size
-    allowed = f"must be at least one batch, {args.batch_size} steps"
-    require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
+    allowed = f"must be at least one batch, {args.batch_size} steps, or 0 with --bc-epochs"
+    clones = args.total_timesteps == 0 and args.bc_epochs > 0
+    require(args.num_iterations >= 1 or clones, "--total-timesteps", args.total_timesteps, allowed)
     require(args.d_steps <= args.batch_size, "--d-steps", args.d_steps, f"must be at most a batch, {args.batch_size}")
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")
@@ -1818,13 +1820,14 @@ def rl_episodes(args: Args) -> list[dict[str, np.ndarray]]:
 
 
 def behaviour_cloning(agent: Agent, experts: Experts, args: Args) -> None:
-    """Warm start: fit the policy's mean to the experts' actions, weighted as in Eq. 2.3.1 (Adam, 3e-4, batches of 128)."""
-    optimizer = torch.optim.Adam(agent.actor_mean.parameters(), 3e-4)
+    """Fit the policy to the experts' actions, weighted as in Eq. 2.3.1: most likely under it (Adam, 3e-4, batches of 128)."""
+    optimizer = torch.optim.Adam([*agent.actor_mean.parameters(), agent.actor_logstd], 3e-4)
     for _ in range(args.bc_epochs * len(experts.human.obs) // 128):
         losses = []
         for demonstrations in experts:
             obs, actions = demonstrations.sample(128)
-            losses.append(F.mse_loss(agent.actor_mean(agent.normalise(obs)), actions))
+            means = agent.actor_mean(agent.normalise(obs))
+            losses.append(-gaussian_log_prob(means, agent.actor_logstd, actions).mean())
         optimizer.zero_grad()
         (args.alpha * losses[0] + (1 - args.alpha) * losses[1]).backward()
         optimizer.step()
@@ -1990,7 +1993,7 @@ def finish_run(
             mode: {name: value for name, value in evaluation[mode].items() if name != "returns"} for mode in MODES
         },
         "training_seconds": seconds,
-        "steps_per_second": global_step / seconds,
+        "steps_per_second": global_step / seconds if global_step else None,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),

@@ -174,6 +174,16 @@ def test_a_student_of_another_task(tmp_path):
     assert result["experts"].keys() == {"rl"} and not (tmp_path / "run" / "demos_synthetic_human").exists()
 
 
+def test_mixing_the_actions_alone(expert, tmp_path):
+    """Behaviour cloning without a step of GAIL; sent again, it is done."""
+    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--bc-epochs", 1, "--total-timesteps", 0, "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=GAIL)
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["complete"] and result["global_step"] == 0 and result["steps_per_second"] is None
+    assert result["evaluation"]["greedy"]["episodes"] == 2
+    assert "is done" in run(*flags, "--resume", cwd=tmp_path, script=GAIL).stdout
+
+
 def test_recorded_demonstrations_are_those_that_are_learned_from(student, expert, tmp_path):
     """The synthetic human's folder given as a recording leads to the same student."""
     flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--demos-human", student / "demos_synthetic_human"]
@@ -202,6 +212,7 @@ BAD_GAIL = [
     (["--alpha", 0, "--max-kl", 0], ["--max-kl", "0.0"]),
     (["--alpha", 0, "--num-steps", 1], ["--num-steps", "1"]),
     (["--alpha", 0, "--total-timesteps", 100], ["--total-timesteps", "100", "1024"]),
+    (["--alpha", 0, "--total-timesteps", 0], ["--total-timesteps", "0", "--bc-epochs"]),
     (["--alpha", 0, "--reward-form", "odd"], ["--reward-form", "odd"]),
     (["--alpha", 1, "--demos-rl", "no/such/folder"], ["--demos-rl", "no/such/folder", "manifest"]),
     (["--alpha", 0, "--demos-human", "no/such/folder"], ["--demos-human", "no/such/folder", "manifest"]),

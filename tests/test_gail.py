@@ -234,3 +234,22 @@ def test_a_step_of_trpo_is_sb3_contrib_s(env_id, monkeypatch):
     parameters = [*policy_net.parameters(), *theirs.policy.action_net.parameters(), theirs.policy.log_std]
     found = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
     assert (found - policy.vector).norm() < 1e-3 * (found - old).norm()
+
+
+def test_behaviour_cloning_mixes_two_actions_into_one_between_them():
+    """Experts who steer to opposite sides: the mean is the weighted one, which neither takes (section 2.3.2)."""
+    space = gym.spaces.Box(-1, 1, (1,))
+    rng = np.random.default_rng(0)
+
+    def expert(action: float) -> gail.Demonstrations:
+        observations = rng.standard_normal((2_001, OBS))
+        return gail.Demonstrations([{"observations": observations, "actions": np.full((2_000, 1), action)}], space)
+
+    torch.manual_seed(0)
+    agent = gail.Agent(OBS, 1, 16)
+    experts = gail.Experts(rl=expert(-0.8), human=expert(0.8))
+    gail.behaviour_cloning(agent, experts, gail.Args(alpha=0.25, bc_epochs=120))
+    means = agent.actor_mean(experts.human.obs)
+    assert means.mean().item() == pytest.approx(0.4, abs=0.03) and means.std() < 0.1
+    spread = 0.8 * 2 * (0.25 * 0.75) ** 0.5  # deviation of a coin between both
+    assert agent.actor_logstd.exp().item() == pytest.approx(spread, rel=0.1)
