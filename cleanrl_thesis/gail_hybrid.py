@@ -20,6 +20,7 @@ agent, and not yet calibrated to Table 2.3, where it is to the expert as 637 to 
 | KL bound, discriminator's learning rate | 0.01, 1e-3 | section 2.4.3 |
 | networks | two layers of 100 with tanh, for policy, values and discriminator | the study's code |
 | batch | 1,024 steps for GAIL, else 512; 3 policy updates for one of the discriminator | the study's code |
+| Fisher matrix | from every fifth step of a batch | OpenAI Baselines' |
 | CG iterations, damping; γ, λ; passes over the value function, rate; entropies | 10, 0.1; 0.995, 0.97; 5, 1e-3; 0, 1e-3 | the study's code |
 | which label is the expert's | D → 0 | Eq. 2.3.1; the prose and the study's code have D and 1 − D swapped |
 | normalisation of observations | mean and deviation of the demonstrations, fixed | ours; the study's code keeps running ones |
@@ -133,7 +134,7 @@ class Args:
     """α, weight of the RL expert against the human (Eq. 2.3.1)"""
     total_timesteps: int | None = None
     """environment steps; default: 5,000,000 for α = 0, else 7,500,000 (section 2.4.3)"""
-    num_envs: int = 8
+    num_envs: int = 16
     """environments side by side"""
     num_steps: int | None = None
     """steps of each environment per update; default: 1,024 / num_envs for α = 0, else 512 / num_envs"""
@@ -157,6 +158,8 @@ class Args:
     """iterations of the conjugate gradient method"""
     cg_damping: float = 0.1
     """multiple of the identity that is added to the Fisher matrix"""
+    fisher_every: int = 5
+    """which steps of a batch the Fisher matrix is estimated from: every fifth (Baselines)"""
     gamma: float = 0.995
     """discount factor γ"""
     gae_lambda: float = 0.97
@@ -221,7 +224,11 @@ def complete_args(args: Args) -> Args:
     counts = "num_threads num_envs eval_episodes checkpoint_interval stop_at human_episodes hidden_size"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
-        ("g_steps d_steps value_epochs value_batch_size cg_iterations", lambda x: x >= 1, "must be at least 1"),
+        (
+            "g_steps d_steps value_epochs value_batch_size cg_iterations fisher_every",
+            lambda x: x >= 1,
+            "must be at least 1",
+        ),
         ("learning_rate value_learning_rate max_kl", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("kl_slack", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("cg_damping ent_coef d_ent_coef", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
@@ -1365,7 +1372,7 @@ def trpo_step(policy: PolicyVector, batch: Batch, args: Args) -> dict[str, float
     gradient = torch.func.grad(objective)(old)
     before = objective(old)
 
-    multiply = fisher_product(policy, old, batch.obs, args.cg_damping)
+    multiply = fisher_product(policy, old, batch.obs[:: args.fisher_every], args.cg_damping)
     direction = conjugate_gradient(multiply, gradient, args.cg_iterations)
     full = direction * torch.sqrt(2 * args.max_kl / (direction @ multiply(direction)).clamp(min=1e-12))
     for halvings in range(10):
@@ -1821,7 +1828,7 @@ def rl_episodes(args: Args) -> list[dict[str, np.ndarray]]:
 
 def behaviour_cloning(agent: Agent, experts: Experts, args: Args) -> None:
     """Fit the policy to the experts' actions, weighted as in Eq. 2.3.1: most likely under it (Adam, 3e-4, batches of 128)."""
-    optimizer = torch.optim.Adam([*agent.actor_mean.parameters(), agent.actor_logstd], 3e-4)
+    optimizer = torch.optim.Adam([*agent.actor_mean.parameters(), agent.actor_logstd], 3e-4, fused=True)
     for _ in range(args.bc_epochs * len(experts.human.obs) // 128):
         losses = []
         for demonstrations in experts:
@@ -1874,8 +1881,8 @@ def main(args: Args) -> int:
     for demonstrations in experts:
         demonstrations.move(device)
     policy = PolicyVector(agent)
-    value_optimizer = torch.optim.Adam(agent.critic.parameters(), args.value_learning_rate)
-    optimizer = torch.optim.Adam(agent.discriminator.parameters(), args.learning_rate)
+    value_optimizer = torch.optim.Adam(agent.critic.parameters(), args.value_learning_rate, fused=True)
+    optimizer = torch.optim.Adam(agent.discriminator.parameters(), args.learning_rate, fused=True)
     players = make_players(args)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
     iteration, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}

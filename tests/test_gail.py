@@ -81,7 +81,7 @@ def test_a_step_of_trpo_improves_the_surrogate_within_the_bound():
 
 def test_without_damping_the_full_step_is_as_long_as_the_bound_allows():
     """½ sᵀ F s = max KL for the step before the line search; in a quadratic model that is the KL divergence."""
-    args = gail.Args(alpha=0.0, cg_damping=1e-4, max_kl=1e-5, cg_iterations=60)
+    args = gail.Args(alpha=0.0, cg_damping=1e-4, max_kl=1e-5, cg_iterations=60, fisher_every=1)
     _, policy, batch = make_batch(2_000)
     metrics = gail.trpo_step(policy, batch, args)
     assert metrics["charts/halvings"] == 0 and metrics["losses/kl"] == pytest.approx(1e-5, rel=0.1)
@@ -226,7 +226,7 @@ def test_a_step_of_trpo_is_sb3_contrib_s(env_id, monkeypatch):
     batch = gail.Batch(steps.observations.float(), steps.actions, steps.actions, advantages, steps.returns)
     same = {"cg_iterations": theirs.cg_max_steps, "cg_damping": theirs.cg_damping, "max_kl": theirs.target_kl}
     same |= {name: action_dim * same[name] for name in ("cg_damping", "max_kl")}
-    metrics = gail.trpo_step(policy, batch, gail.Args(alpha=0.0, **same))
+    metrics = gail.trpo_step(policy, batch, gail.Args(alpha=0.0, fisher_every=1, **same))
     assert metrics["charts/halvings"] == 0
 
     monkeypatch.setattr(torch, "randn_like", torch.zeros_like)  # theirs begins the search at a small random vector
