@@ -48,9 +48,9 @@ def load_method(name: str):
     return module
 
 
-def published_table() -> dict[str, dict[str, str]]:
-    """The rows of Table 2.1 by agent."""
-    with open(ROOT / "benchmark" / "published" / "table_2_1.csv", newline="") as file:
+def published_table(name: str = "table_2_1.csv") -> dict[str, dict[str, str]]:
+    """The rows of a table by agent."""
+    with open(ROOT / "benchmark" / "published" / name, newline="") as file:
         return {row["agent"]: row for row in csv.DictReader(file)}
 
 

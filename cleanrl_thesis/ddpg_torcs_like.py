@@ -12,6 +12,7 @@ after every crash: on the same machine the run ends with the same bytes.
 |---|---|---|
 | steps, replay buffer | 10,000,000; 1,000,000 | section 2.4.3 |
 | learning rate of actor and critic | 1e-4, 1e-3 | OpenAI Baselines' defaults; section 2.4.3 names them the other way round |
+| both annealed to 0 | on | ours; Baselines' are constant |
 | γ, τ, batch, L2 of the critic, layer norm | 0.99, 0.01, 64, 1e-2, on | OpenAI Baselines' defaults |
 | observations | normalised by running statistics, clipped to 5 deviations of at least 0.1 | OpenAI Baselines' defaults |
 | updates | 50 after every 100 steps | OpenAI Baselines' defaults |
@@ -134,6 +135,8 @@ class Args:
     """Adam's learning rate for the actor (Baselines)"""
     learning_rate: float = 1e-3
     """Adam's learning rate for the critic (Baselines)"""
+    anneal_lr: bool = True
+    """anneal both learning rates linearly to 0; off: constant (Baselines)"""
     critic_l2: float = 1e-2
     """weight of half the squared weights of the critic's hidden layers in its loss (Baselines)"""
     hidden_size: int = 64
@@ -1228,10 +1231,15 @@ class FlatAdam:
         self.mean, self.square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
         self.step = torch.zeros((), device=self.vector.device)
         self.actor_size = sum(shape.numel() for shape in self.shapes[: len(self.actor_names)])
-        self.rates = torch.full_like(self.vector, args.learning_rate)
-        self.rates[: self.actor_size] = args.actor_learning_rate
+        self.initial_rates = torch.full_like(self.vector, args.learning_rate)
+        self.initial_rates[: self.actor_size] = args.actor_learning_rate
+        self.rates = self.initial_rates.clone()
         for parameter, value in zip(parameters, views(self.vector, self.shapes)):
             parameter.data = value
+
+    def anneal(self, remaining: float) -> None:
+        """Set the learning rates to a share of the initial ones."""
+        torch.mul(self.initial_rates, remaining, out=self.rates)
 
     def networks(self, vector: torch.Tensor) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         """The actor's and the critic's parameters by name, as views of a vector."""
@@ -1838,6 +1846,7 @@ def main(args: Args) -> int:
                 for i in range(args.num_envs):
                     explorer.begin(i)
 
+        optimizer.anneal(1.0 - before / args.total_timesteps if args.anneal_lr else 1.0)
         for _ in range(args.train_steps if buffer.added >= args.batch_size else 0):
             if updates % args.adapt_interval == 0:
                 distance = explorer.adapt(norm(buffer.sample(args.batch_size, rng).numpy()[:, :obs_dim]))

@@ -833,7 +833,10 @@ class SyntheticDriver:
     room = 3.6  # m between the middles of two cars when it passes
     preview = 1.2  # s, to the point that it steers for
     steering_error, hand_error = 0.15, 0.012  # of each correction, as a share; and of the wheel, as a share of its lock
-    boldness_spread = 0.06  # deviation between episodes of the speeds that it dares, as a share
+    boldness, boldness_spread = (
+        1.0,
+        0.06,
+    )  # median and deviation between episodes of the speeds that it dares, as shares
 
     def __init__(self, cars: Cars, seed: int):
         self.cars, self.rng = cars, np.random.default_rng(np.random.SeedSequence([seed, HUMAN_STREAM]))
@@ -841,7 +844,7 @@ class SyntheticDriver:
         self.step, self.next_look = 0, np.zeros(num_cars)
         self.hands = np.zeros((self.reaction + 1, 2, num_cars))  # steering and pedal of the last steps
         self.decided = np.zeros((2, num_cars))
-        self.boldness = np.exp(self.boldness_spread * self.rng.standard_normal(num_cars))
+        self.boldness = self.boldness * np.exp(self.boldness_spread * self.rng.standard_normal(num_cars))
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """Actions (N, 2) for the next step; it sees the road itself and not the observations."""

@@ -98,6 +98,20 @@ def test_compiled_update_is_the_plain_one():
     assert torch.allclose(plain_optimizer.target, optimizer.target, atol=1e-5)
 
 
+@pytest.mark.parametrize("compile", [False, pytest.param(True, marks=needs_compiler)])
+def test_learning_rates_are_annealed(compile):
+    """An update is as long as the share of the learning rates that is left, and at 0 none."""
+    *_, optimizer, update, rows = make(compile=compile)
+    lengths = []
+    for remaining in (1.0, 0.5, 0.0):
+        optimizer.anneal(remaining)
+        optimizer.mean.zero_(), optimizer.square.zero_(), optimizer.step.zero_()
+        before = optimizer.vector.clone()
+        update(rows)
+        lengths.append((optimizer.vector - before).norm().item())
+    assert lengths[1] == pytest.approx(lengths[0] / 2, rel=1e-2) and lengths[2] == 0
+
+
 @pytest.mark.parametrize("layer_norm", [True, False])
 def test_the_actor_in_numpy_is_the_actor_in_torch(layer_norm):
     _, agent, optimizer, *_ = make(layer_norm=layer_norm)

@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# The driving task: a DDPG expert for each seed, hybrids over α, and clones of the drivers' actions alone; the runs behind
+# benchmark/results/torcs/. Can be sent again after every stop.
+#   benchmark/torcs_alpha.sh
+#   SEEDS="1" ALPHAS="0.5" WORKERS=1 benchmark/torcs_alpha.sh
+set -euo pipefail
+cd "$(dirname "$0")/.."
+SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/torcs}
+ALPHAS=${ALPHAS:-0.5 0.0 1.0 0.7 0.3 0.9 0.1 0.8 0.2 0.6 0.4}
+MIXED=${MIXED:-0.5 0.0 1.0}
+mkdir -p "$RUNS"
+for seed in $SEEDS; do
+  echo "--seed $seed --run-dir $RUNS/expert_seed$seed"
+done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220 --resume
+student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
+  echo --seed "$1" --alpha "$2" --demos-rl "$RUNS/expert_seed$1/demos" --run-dir "$RUNS/$3_seed$1" "${@:4}"
+}
+{
+  for alpha in $MIXED; do
+    for seed in $SEEDS; do student "$seed" "$alpha" "mix_alpha$alpha" --total-timesteps 0 --bc-epochs 20; done
+  done
+  for alpha in $ALPHAS; do
+    for seed in $SEEDS; do student "$seed" "$alpha" "alpha$alpha"; done
+  done
+} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/gail_hybrid.py --save-model --save-demos 20 --eval-episodes 100 --resume
+"$PYTHON" benchmark/torcs_report.py --runs "$RUNS"

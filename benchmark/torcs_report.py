@@ -1,0 +1,315 @@
+"""The driving runs -> Table 2.3, Fig. 2.8, and how each driver drives.
+
+    python benchmark/torcs_report.py        # runs/torcs -> benchmark/results/torcs
+
+Takes whatever part of the runs of `benchmark/torcs_alpha.sh` is done, and says which. The score is that of Table 2.3:
+metres in windows of 5 s times 3.6, 0 for a window with a crash, as the mean of each episode; intervals are 95%
+t-intervals of the seeds' means.
+"""
+
+import json
+import re
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from apple_players import ROOT, commit, published_table
+from apple_report import commit_of, interval, with_interval, write_csv
+from matplotlib.figure import Figure
+
+from cleanrl_thesis import gail_hybrid as gail
+
+MODES = ("sampled", "greedy")
+EXPERTS = {"rl": "DDPG", "human": "human"}
+BEFORE = 60.0  # m before a curve, where its braking is measured from
+TREMBLE = 0.05  # a turn of the wheel by less of its lock is not counted as a change
+
+
+@dataclass
+class Args:
+    runs: Path = Path("runs/torcs")
+    """folder of the runs' folders"""
+    out: Path = ROOT / "benchmark" / "results" / "torcs"
+    """folder for tables and figures"""
+    note: str = ""
+    """a sentence put above the tables, on what the runs do not record themselves"""
+
+
+def read_runs(folder: Path) -> list[dict]:
+    """A row for every finished run and way to act, and for both experts as each student had them."""
+    rows = []
+    for path in sorted(folder.glob("*/result.json")):
+        result, args = json.loads(path.read_text()), json.loads((path.parent / "args.json").read_text())
+        if not result["complete"] or "driving" not in json.dumps(result["evaluation"]):
+            continue
+        kind = re.sub(r"_seed\d+$", "", path.parent.name)
+        is_student = "greedy" in result["evaluation"]
+        evaluations = result["evaluation"] if is_student else {"without noise": result["evaluation"]}
+        evaluations = {(kind, mode): numbers for mode, numbers in evaluations.items()}
+        if is_student:
+            evaluations |= {(EXPERTS[name], "demonstrations"): part for name, part in result["experts"].items()}
+        for (name, mode), numbers in evaluations.items():
+            driving = numbers["driving"]
+            rows.append(
+                {
+                    "kind": name,
+                    "seed": result["seed"],
+                    "of_run": path.parent.name,
+                    "alpha": args.get("alpha", ""),
+                    "mode": mode,
+                    "episodes": numbers["episodes"],
+                    **{key: round(driving["score"][key], 2) for key in ("mean", "std", "min", "max")},
+                    "metres_in_5_s": round(driving["metres_in_5_s"]["mean"], 2),
+                    "crashes": driving["crashes"],
+                    "mean_laps": round(float(np.mean(driving["laps"])), 3),
+                    "steps": result["global_step"],
+                    "training_seconds": round(result["training_seconds"]),
+                    "script_sha256": result["script_sha256"][:12],
+                }
+            )
+    return rows
+
+
+def select(rows: list[dict], kind: str, mode: str) -> list[dict]:
+    """One row for each seed; the experts' are the same in every run that was given them."""
+    found = {row["seed"]: row for row in rows if row["kind"] == kind and row["mode"] == mode}
+    return [found[seed] for seed in sorted(found)]
+
+
+def table_2_3(rows: list[dict]) -> str:
+    """Table 2.3, published beside measured."""
+    published = published_table("table_2_3.csv")
+    share = float(published["DDPG"]["avg"])
+    lines = ["| driver | | seeds | max | min | avg | std | of DDPG's | crashed | laps in 60 s |", "|---|" + "---|" * 9]
+    expert, _ = interval([row["mean"] for row in select(rows, "DDPG", "demonstrations")])
+    groups = {
+        "DDPG": [("demonstrations", "DDPG")],
+        "hybrid, α = 0.5": [(mode, "alpha0.5") for mode in MODES],
+        "human": [("demonstrations", "human")],
+        "GAIL, α = 0": [(mode, "alpha0.0") for mode in MODES],
+        "GAIL on DDPG, α = 1": [(mode, "alpha1.0") for mode in MODES],
+        "actions mixed, α = 0.5": [(mode, "mix_alpha0.5") for mode in MODES],
+        "actions cloned, α = 0": [(mode, "mix_alpha0.0") for mode in MODES],
+        "actions cloned, α = 1": [(mode, "mix_alpha1.0") for mode in MODES],
+    }
+    for name, group in groups.items():
+        if name in published:
+            cells = [published[name][key] for key in ("max", "min", "avg", "std")]
+            lines.append(
+                f"| {name} | **published** | | {' | '.join(cells)} | {float(published[name]['avg']) / share:.2f} | | |"
+            )
+        for mode, kind in group:
+            found = select(rows, kind, mode)
+            if found:
+                extremes = [f"{max(row['max'] for row in found):.0f}", f"{min(row['min'] for row in found):.0f}"]
+                means = [with_interval([row[key] for row in found], 1) for key in ("mean", "std")]
+                crashed = sum(row["crashes"] for row in found) / sum(row["episodes"] for row in found)
+                ratio = f"{np.mean([row['mean'] for row in found]) / expert:.2f}"
+                laps = f"{np.mean([row['mean_laps'] for row in found]):.2f}"
+                cells = (name, mode, len(found), *extremes, *means, ratio, f"{100 * crashed:.0f}%", laps)
+                lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join(lines) + "\n"
+
+
+def alpha_curve(rows: list[dict], mode: str) -> dict[float, list[float]]:
+    """The score of each seed for each α."""
+    curve = defaultdict(list)
+    for row in rows:
+        if re.fullmatch(r"alpha[\d.]+", row["kind"]) and row["mode"] == mode:
+            curve[row["alpha"]].append(row["mean"])
+    return dict(sorted(curve.items()))
+
+
+def alpha_table(rows: list[dict]) -> str:
+    """Fig. 2.8 in numbers; in brackets the number of seeds."""
+    curves = {mode: alpha_curve(rows, mode) for mode in MODES}
+    lines = [f"| α | {' | '.join(MODES)} |", "|---|---|---|"]
+    for alpha in curves["sampled"]:
+        cells = [f"{with_interval(curves[mode][alpha], 1)} ({len(curves[mode][alpha])})" for mode in MODES]
+        lines.append(f"| {alpha} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def figure_2_8(rows: list[dict]) -> Figure:
+    """Score over α as a share of the DDPG expert's, with the published ones."""
+    figure = Figure(figsize=(7.5, 4.2), layout="constrained")
+    axes = figure.subplots()
+    expert, _ = interval([row["mean"] for row in select(rows, "DDPG", "demonstrations")])
+    human, _ = interval([row["mean"] for row in select(rows, "human", "demonstrations")])
+    for mode, colour in zip(MODES, ("tab:blue", "tab:orange")):
+        curve = alpha_curve(rows, mode)
+        means, halves = np.array([interval(scores) for scores in curve.values()]).T / expert
+        axes.plot(list(curve), means, "o-", color=colour, markersize=4, label=f"hybrid, {mode}")
+        low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
+        axes.fill_between(list(curve), low, high, color=colour, alpha=0.15, linewidth=0)
+        mixed = {row["alpha"]: row for row in rows if row["kind"].startswith("mix_alpha") and row["mode"] == mode}
+        points = {alpha: [r["mean"] for r in select(rows, row["kind"], mode)] for alpha, row in sorted(mixed.items())}
+        if points:
+            heights = [np.mean(scores) / expert for scores in points.values()]
+            axes.plot(list(points), heights, "x", color=colour, label=f"actions mixed by cloning, {mode}")
+    axes.axhline(1, color="black", linestyle="--", linewidth=1, label=f"DDPG, {expert:.0f}")
+    axes.axhline(human / expert, color="black", linestyle=":", linewidth=1, label=f"synthetic human, {human:.0f}")
+    published = {name: float(row["avg"]) for name, row in published_table("table_2_3.csv").items()}
+    stars = {0.0: published["GAIL, α = 0"] / published["DDPG"], 0.5: published["hybrid, α = 0.5"] / published["DDPG"]}
+    axes.plot(list(stars), list(stars.values()), "k*", markersize=9, label="published, of its DDPG (819)")
+    axes.set(xlabel="α, weight of the DDPG expert", ylabel="score, as a share of the DDPG expert's", ylim=(0, None))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
+    seeds = sorted({len(scores) for scores in alpha_curve(rows, "sampled").values()})
+    axes.set_title(f"Fig. 2.8: {' to '.join(map(str, sorted({seeds[0], seeds[-1]})))} seeds, bands are 95% intervals")
+    return figure
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# How they drive
+# ---------------------------------------------------------------------------------------------------------------------
+def read_episodes(folder: Path, most: int) -> list[dict[str, np.ndarray]]:
+    """The first demonstrations in a folder; none where there is none."""
+    episodes = []
+    for path in sorted(folder.glob("episode_*.npz"))[:most]:
+        with np.load(path, allow_pickle=False) as arrays:
+            episodes.append(dict(arrays))
+    return episodes
+
+
+def traces(episode: dict[str, np.ndarray], track) -> dict[str, np.ndarray]:
+    """What an episode's car did after each step, (T,): m raced since the start line, m left, km/h, wheel."""
+    progress = np.where(episode["rewards"] == -1, 0, episode["rewards"])
+    obs = episode["observations"][1:]
+    left = obs[:, 20] * track.half_width
+    return {
+        "place": gail.START + np.cumsum(progress),
+        "left": left,
+        "speed": obs[:, 21] * 300,
+        "wheel": episode["actions"][:, 0].clip(-1, 1),
+    }
+
+
+def crossings(place: np.ndarray, marks: np.ndarray, length: float) -> list[tuple[int, int]]:
+    """(number of the mark, first step beyond it) for each time that a mark of the road is passed."""
+    laps = np.arange(int(place[-1] // length) + 1)
+    goals = (marks[:, None] + laps * length).ravel()
+    numbers = np.repeat(np.arange(len(marks)), len(laps))
+    is_passed = (goals > place[0]) & (goals <= place[-1])
+    return list(zip(numbers[is_passed].tolist(), np.searchsorted(place, goals[is_passed]).tolist()))
+
+
+def wheel_changes(wheel: np.ndarray) -> int:
+    """How often the wheel begins to turn the other way, by more than TREMBLE of its lock."""
+    changes, extreme, direction = 0, wheel[0], 0
+    for angle in wheel:
+        if direction * (angle - extreme) > 0:
+            extreme = angle
+        elif abs(angle - extreme) > TREMBLE:
+            changes += direction != 0
+            direction, extreme = (1 if angle > extreme else -1), angle
+    return changes
+
+
+def habits(episodes: list[dict[str, np.ndarray]], track) -> dict[str, float]:
+    """What participants named, as numbers."""
+    parked, parked_left = np.array(gail.PARKED, float), np.array(gail.PARKED_LEFT) * track.half_width
+    curves = track.distances[(track.curvatures != 0) & (np.roll(track.curvatures, 1) != track.curvatures)]
+    found = defaultdict(list)
+    steps = sum(len(episode["rewards"]) for episode in episodes)
+    changes = crashes = into_cars = 0
+    for episode in episodes:
+        trace = traces(episode, track)
+        place, speed = trace["place"], trace["speed"]
+        changes += wheel_changes(trace["wheel"])
+        found["speed"] += speed.tolist()
+        for _, step in crossings(place, curves, track.length):
+            before = np.searchsorted(place, place[step] - BEFORE)
+            if before:
+                found["into curves"].append(speed[step])
+                found["slowing"].append(speed[before] - speed[step])
+        for number, step in crossings(place, parked, track.length):
+            way = trace["left"][step] - parked_left[number]
+            found["gap"].append(abs(way) - gail.CAR_WIDTH)
+            found[f"left of {number}"].append(way > 0)
+        if (episode["rewards"] == -1).any():
+            crashes += 1
+            ways = (parked - place[-1] + 8) % track.length - 8
+            into_cars += bool((np.abs(ways) < gail.CAR_LENGTH + 1).any())
+    means = {name: float(np.mean(values)) for name, values in found.items()}
+    return {**means, "changes": changes * gail.FPS / steps, "crashes": crashes, "into cars": into_cars}
+
+
+def drivers(folder: Path, most: int) -> dict[str, list[list[dict[str, np.ndarray]]]]:
+    """Demonstrations of each driver, a list for each seed that has some."""
+    found = defaultdict(list)
+    for run in sorted(folder.glob("*_seed*")):
+        kind = re.sub(r"_seed\d+$", "", run.name)
+        found["DDPG" if kind == "expert" else kind].append(read_episodes(run / "demos", most))
+        if kind == "alpha0.0":
+            found["human"].append(read_episodes(run / "demos_synthetic_human", most))
+    names = ["human", "DDPG", *sorted(found.keys() - {"human", "DDPG"})]
+    return {name: kept for name in names if (kept := [episodes for episodes in found[name] if episodes])}
+
+
+def habit_tables(folder: Path, most: int) -> str:
+    """How each driver drives; and on which side of each parked car."""
+    track = gail.Track(*gail.TRACKS["meadow"])
+    measured = {name: [habits(part, track) for part in seeds] for name, seeds in drivers(folder, most).items()}
+    columns = {
+        "speed": "km/h",
+        "into curves": "into curves, km/h",
+        "slowing": f"slowed down {BEFORE:.0f} m before them by, km/h",
+        "gap": "gap to parked cars, m",
+        "changes": "wheel turned back, per s",
+    }
+    lines = [f"| driver | seeds | {' | '.join(columns.values())} | crashes | of them into cars |", "|---|" + "---|" * 8]
+    for name, seeds in measured.items():
+        cells = [with_interval([habit[key] for habit in seeds if key in habit], 1) for key in columns]
+        sums = [sum(habit[key] for habit in seeds) for key in ("crashes", "into cars")]
+        lines.append(f"| {name} | {len(seeds)} | {' | '.join(map(str, [*cells, *sums]))} |")
+    lines += ["", "Share of passes on the left of each parked car, by its way from the start line:", ""]
+    lines += [f"| driver | {' | '.join(f'{way} m' for way in gail.PARKED)} |", "|---|" + "---|" * len(gail.PARKED)]
+    for name, seeds in measured.items():
+        sides = [[habit[f"left of {i}"] for habit in seeds if f"left of {i}" in habit] for i in range(len(gail.PARKED))]
+        lines.append(f"| {name} | {' | '.join(f'{np.mean(side):.2f}' if side else '' for side in sides)} |")
+    return "\n".join(lines) + "\n"
+
+
+def provenance(rows: list[dict]) -> str:
+    """What the results rest on."""
+    own = [row for row in rows if row["mode"] in ("greedy", "without noise")]
+    hours = sum(row["training_seconds"] for row in own) / 3600
+    scripts = {"ddpg_torcs_like": "expert", "gail_hybrid": "alpha"}
+    made_at = []
+    for script, part in scripts.items():
+        digests = {row["script_sha256"] for row in own if part in row["kind"]}
+        made_at.append(f"{script}.py at {', '.join(sorted(commit_of(script, digest) for digest in digests))}")
+    seeds = ", ".join(map(str, sorted({row["seed"] for row in own})))
+    return (
+        f"`benchmark/torcs_alpha.sh`, commits: {'; '.join(made_at)}; this report at {commit()}. {len(own)} runs, "
+        f"{hours:.1f} core-hours of training, seeds {seeds}; each ± is a 95% t-interval over seeds.\n\n"
+    )
+
+
+def main(args: Args) -> None:
+    rows = read_runs(args.runs)
+    if not rows:
+        raise SystemExit(f"--runs {args.runs}: holds no finished run")
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_csv(args.out / "runs.csv", rows)
+    sections = {
+        "Table 2.3": table_2_3(rows),
+        "Fig. 2.8": alpha_table(rows),
+        "How they drive": habit_tables(args.runs, 20),
+    }
+    text = (
+        provenance(rows)
+        + (f"{args.note}\n\n" if args.note else "")
+        + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
+    )
+    (args.out / "table.md").write_text(text)
+    if alpha_curve(rows, "sampled"):
+        figure_2_8(rows).savefig(args.out / "fig_2_8.png", dpi=130)
+    print(text)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
