@@ -3,8 +3,10 @@
     python benchmark/speed.py ppo                                  # about 15 minutes; needs the group `bench`
     python benchmark/speed.py ppo --update-epochs 10 --rounds 1    # a first look
     python benchmark/speed.py apple                                # the game alone, and DQN on it; about 3 minutes
+    python benchmark/speed.py torcs                                # the simulator alone, and DDPG on it; about 8 minutes
+    python benchmark/speed.py gail                                 # GAIL beside TRPO without it; about 5 minutes
 
-Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple}.json` and `.md`: the median of each contender and of its ratios to
+Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,torcs,gail}.json` and `.md`: the median of each contender and of its ratios to
 the peer, round by round, with their range. The ratios are the result: the machine's own speed drifts.
 """
 
@@ -28,7 +30,7 @@ PEER = "stable-baselines3"
 
 @dataclass
 class Args:
-    what: tyro.conf.Positional[Literal["ppo", "apple"]]
+    what: tyro.conf.Positional[Literal["ppo", "apple", "torcs", "gail"]]
     """what to time"""
     rounds: int = 4
     """how often each contender runs, in turn"""
@@ -96,7 +98,7 @@ def dqn_contenders(work: Work) -> dict:
 
 
 def measure(work: Work, contenders: dict, rounds: int) -> dict:
-    """Let the contenders run in turn; return each one's figures, round by round, and its ratios to the peer."""
+    """Let the contenders run in turn; return each one's figures, round by round, and its ratios to the first, the peer."""
     figures = {name: [] for name in contenders}
     name_of_work = work.env_id if work.update_epochs is None else f"{work.env_id} K={work.update_epochs}"
     for round_number in range(rounds):
@@ -105,25 +107,50 @@ def measure(work: Work, contenders: dict, rounds: int) -> dict:
             speed = figures[name][-1]["steps_per_second"]
             print(f"{name_of_work} round {round_number + 1} {name}: {speed:,.0f} steps/s", flush=True)
     speeds = {name: [row["steps_per_second"] for row in rows] for name, rows in figures.items()}
-    ratios = {name: [own / peer for own, peer in zip(speeds[name], speeds[PEER])] for name in contenders}
+    peer_speeds = speeds[next(iter(contenders))]
+    ratios = {name: [own / peer for own, peer in zip(speeds[name], peer_speeds)] for name in contenders}
     memory = {name: max(row["peak_memory_mb"] for row in rows) for name, rows in figures.items()}
     return {**vars(work), "steps_per_second": speeds, "ratio": ratios, "peak_memory_mb": memory}
 
 
-def time_game(num_envs: int, steps: int, rounds: int) -> list[float]:
-    """Game steps per second of the vectorised Apple game alone, with random actions, one thread, round by round."""
+def ddpg_contenders(work: Work) -> dict:
+    flags = ["--total-timesteps", work.steps]
+    return {
+        PEER: lambda: time_peer("sb3_ddpg.py", work.steps // 10),
+        "plain, --frame-skip 1": lambda: time_ours("ddpg_torcs_like.py", *flags, "--frame-skip", 1),
+        "--compile --frame-skip 1": lambda: time_ours("ddpg_torcs_like.py", *flags, "--frame-skip", 1, "--compile"),
+        "--compile": lambda: time_ours("ddpg_torcs_like.py", *flags, "--compile"),
+    }
+
+
+def trpo_contenders(work: Work, demos: Path) -> dict:
+    """Every step of a batch for the Fisher matrix, as the peer, and a round of the discriminator after each batch."""
+    flags = ["--env-id", work.env_id, "--num-envs", 1, "--num-steps", 2048, "--alpha", 1, "--demos-rl", demos]
+    flags += ["--fisher-every", 1, "--g-steps", 1, "--total-timesteps", work.steps]
+    return {
+        "sb3-contrib, TRPO": lambda: time_peer("sb3_trpo.py", work.env_id, work.steps // 2048),
+        "gail_hybrid.py, GAIL": lambda: time_ours("gail_hybrid.py", *flags),
+    }
+
+
+def time_environment(name: str, num_envs: int, steps: int, rounds: int) -> list[float]:
+    """Steps per second of a vectorised environment alone, with random actions, one thread, round by round."""
     import gymnasium as gym
     import numpy as np
 
-    name = "cleanrl_thesis.dqn_apple:AppleGame-v0"
-    games = gym.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point")
-    games.reset(seed=1)
-    actions = np.random.default_rng(1).integers(0, 9, (steps, num_envs))
+    envs = gym.make_vec(name, num_envs=num_envs, vectorization_mode="vector_entry_point")
+    envs.reset(seed=1)
+    rng = np.random.default_rng(1)
+    space = envs.single_action_space
+    if isinstance(space, gym.spaces.Discrete):
+        actions = rng.integers(0, space.n, (steps, num_envs))
+    else:
+        actions = rng.uniform(space.low, space.high, (steps, num_envs, *space.shape)).astype(np.float32)
     speeds = []
     for _ in range(rounds):
         start = time.perf_counter()
         for action in actions:
-            games.step(action)
+            envs.step(action)
         speeds.append(num_envs * steps / (time.perf_counter() - start))
     return speeds
 
@@ -150,7 +177,7 @@ def write_results(args: Args, name: str, flags: str, results: list[dict], more: 
     (args.out / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
     text = f"Steps per second, {args.rounds} rounds in turn, one thread each (`{line}`, commit {commit[:7]})\n\n{table(results)}"
     for key, speeds in (more or {}).items():
-        median, low, high = (f"{value / 1e6:.1f}" for value in (statistics.median(speeds), min(speeds), max(speeds)))
+        median, low, high = (f"{value / 1e6:.2f}" for value in (statistics.median(speeds), min(speeds), max(speeds)))
         text += f"\n{key}: {median} million steps/s ({low} to {high})\n"
     (args.out / f"{name}.md").write_text(text)
     print(text)
@@ -165,13 +192,31 @@ def time_ppo(args: Args) -> None:
 
 
 def time_apple(args: Args) -> None:
-    game = {"AppleGame-v0, 4,096 games side by side": time_game(4096, 1_000, args.rounds)}
+    name = "cleanrl_thesis.dqn_apple:AppleGame-v0"
+    game = {"AppleGame-v0, 4,096 games side by side": time_environment(name, 4096, 1_000, args.rounds)}
     work = Work("AppleGame-v0", None, 50_000)
     write_results(args, "apple", "", [measure(work, dqn_contenders(work), args.rounds)], game)
+
+
+def time_torcs(args: Args) -> None:
+    name = "cleanrl_thesis.ddpg_torcs_like:TorcsLike-v0"
+    simulator = {"TorcsLike-v0, 1,024 cars side by side": time_environment(name, 1024, 400, args.rounds)}
+    work = Work("TorcsLike-v0", None, 60_000)
+    write_results(args, "torcs", "", [measure(work, ddpg_contenders(work), args.rounds)], simulator)
+
+
+def time_gail(args: Args) -> None:
+    work = Work("Hopper-v5", None, 20 * 2048)
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, ROOT / "cleanrl_thesis" / "ppo_continuous_kle.py", "--env-id", work.env_id]
+        command += ["--total-timesteps", 2048, "--save-demos", 50, "--eval-episodes", 1, "--run-dir", "expert"]
+        run_process([str(word) for word in command], folder)
+        contenders = trpo_contenders(work, Path(folder) / "expert" / "demos")
+        write_results(args, "gail", "", [measure(work, contenders, args.rounds)])
 
 
 if __name__ == "__main__":
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # before numpy is imported
     arguments = tyro.cli(Args)
-    {"ppo": time_ppo, "apple": time_apple}[arguments.what](arguments)
+    {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail}[arguments.what](arguments)

@@ -14,7 +14,7 @@ from scipy import stats
 sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
 
 
-report, speed, apple = map(importlib.import_module, ("report", "speed", "apple_report"))
+report, speed, apple, torcs = map(importlib.import_module, ("report", "speed", "apple_report", "torcs_report"))
 
 
 def test_interval_is_that_of_the_t_test():
@@ -142,3 +142,43 @@ def test_interval_of_the_seeds_is_that_of_the_t_distribution():
     mean, half = apple.interval([1.0, 2.0, 3.0, 4.0, 5.0])
     low, high = stats.t.interval(0.95, 4, loc=3.0, scale=math.sqrt(2.5 / 5))
     assert math.isclose(mean - half, low) and math.isclose(mean + half, high)
+
+
+# Driving
+def test_marks_of_the_road_are_passed_once_a_lap():
+    place = np.arange(205.0, 4_600.0, 10.0)  # two laps and some of a road of 2,000 m
+    found = torcs.crossings(place, np.array([100.0, 300.0, 900.0]), 2_000.0)
+    assert sorted((number, place[step]) for number, step in found) == [
+        (0, 2_105.0),
+        (0, 4_105.0),
+        (1, 305.0),
+        (1, 2_305.0),
+        (1, 4_305.0),
+        (2, 905.0),
+        (2, 2_905.0),
+    ]
+
+
+def test_the_wheel_turns_back_where_it_does_by_more_than_a_tremble():
+    wheel = [0, 0.2, 0.4, 0.38, 0.5, 0.1, -0.3, -0.28, -0.31, 0.2, 0.2, 0.24]
+    assert torcs.wheel_changes(np.array(wheel)) == 2  # at 0.5 and at -0.31
+    assert torcs.wheel_changes(0.04 * np.arange(50.0)) == 0
+    times = np.arange(0, 10, 0.02)
+    assert torcs.wheel_changes(np.sin(2 * np.pi * times)) == 20
+
+
+def test_habits_of_a_car_whose_way_is_known():
+    """70 km/h throughout, 2 m left of the middle, past the first two parked cars."""
+    track = torcs.gail.Track(*torcs.gail.TRACKS["meadow"])
+    steps = 700
+    observations = np.zeros((steps + 1, 65), np.float32)
+    observations[:, 20], observations[:, 21] = 2 / track.half_width, 70 / 300
+    episode = {"rewards": np.full(steps, 70 / 3.6 / 50), "observations": observations, "actions": np.zeros((steps, 2))}
+    found = torcs.habits([episode], track)
+    assert found["speed"] == pytest.approx(70) and found["slowing"] == pytest.approx(0, abs=1e-4)
+    gaps = [abs(2 - left * track.half_width) - torcs.gail.CAR_WIDTH for left in torcs.gail.PARKED_LEFT[:2]]
+    assert found["gap"] == pytest.approx(np.mean(gaps), abs=1e-5)
+    assert (found["left of 0"], found["left of 1"], found["changes"], found["crashes"]) == (0, 1, 0, 0)
+    crash = {**episode, "rewards": np.append(episode["rewards"][:-1], -1)}
+    found = torcs.habits([crash], track)
+    assert found["crashes"] == 1 and found["into cars"] == 0
