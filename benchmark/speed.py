@@ -114,13 +114,18 @@ def measure(work: Work, contenders: dict, rounds: int) -> dict:
 
 
 def ddpg_contenders(work: Work) -> dict:
-    flags = ["--total-timesteps", work.steps]
-    return {
-        PEER: lambda: time_peer("sb3_ddpg.py", work.steps // 10),
-        "plain, --frame-skip 1": lambda: time_ours("ddpg_torcs_like.py", *flags, "--frame-skip", 1),
-        "--compile --frame-skip 1": lambda: time_ours("ddpg_torcs_like.py", *flags, "--frame-skip", 1, "--compile"),
-        "--compile": lambda: time_ours("ddpg_torcs_like.py", *flags, "--compile"),
+    """Like for like with one car; then ten side by side; then as by default, where an action is held for 5 steps."""
+    ours = {
+        "plain, 1 car": ["--frame-skip", 1, "--num-envs", 1],
+        "--compile, 1 car": ["--compile", "--frame-skip", 1, "--num-envs", 1],
+        "--compile, 10 cars": ["--compile", "--frame-skip", 1],
+        "--compile, 10 cars, 5 steps an action": ["--compile"],
     }
+
+    def contender(flags: list):
+        return lambda: time_ours("ddpg_torcs_like.py", "--total-timesteps", work.steps, *flags)
+
+    return {PEER: lambda: time_peer("sb3_ddpg.py", work.steps // 4), **{name: contender(f) for name, f in ours.items()}}
 
 
 def trpo_contenders(work: Work, demos: Path) -> dict:
@@ -145,7 +150,7 @@ def time_environment(name: str, num_envs: int, steps: int, rounds: int) -> list[
     if isinstance(space, gym.spaces.Discrete):
         actions = rng.integers(0, space.n, (steps, num_envs))
     else:
-        actions = rng.uniform(space.low, space.high, (steps, num_envs, *space.shape)).astype(np.float32)
+        actions = rng.uniform((-0.1, 0), (0.1, 1), (steps, num_envs, 2)).astype(np.float32)  # so that the cars drive
     speeds = []
     for _ in range(rounds):
         start = time.perf_counter()
@@ -201,7 +206,7 @@ def time_apple(args: Args) -> None:
 def time_torcs(args: Args) -> None:
     name = "cleanrl_thesis.ddpg_torcs_like:TorcsLike-v0"
     simulator = {"TorcsLike-v0, 1,024 cars side by side": time_environment(name, 1024, 400, args.rounds)}
-    work = Work("TorcsLike-v0", None, 60_000)
+    work = Work("TorcsLike-v0", None, 40_000)
     write_results(args, "torcs", "", [measure(work, ddpg_contenders(work), args.rounds)], simulator)
 
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The driving task: a DDPG expert for each seed, hybrids over α, and clones of the drivers' actions alone; the runs behind
-# benchmark/results/torcs/. Can be sent again after every stop.
+# benchmark/results/torcs/. Can be sent again after every stop. Each seed takes 1.1 GB of disk.
 #   benchmark/torcs_alpha.sh
 #   SEEDS="1" ALPHAS="0.5" WORKERS=1 benchmark/torcs_alpha.sh
 set -euo pipefail
@@ -12,8 +12,12 @@ mkdir -p "$RUNS"
 for seed in $SEEDS; do
   echo "--seed $seed --run-dir $RUNS/expert_seed$seed"
 done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220 --resume
+for seed in $SEEDS; do
+  human="$RUNS/human_seed$seed"
+  [ -e "$human/manifest.json" ] || "$PYTHON" benchmark/torcs_players.py --seed "$seed" --demos "$human"
+done
 student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
-  echo --seed "$1" --alpha "$2" --demos-rl "$RUNS/expert_seed$1/demos" --run-dir "$RUNS/$3_seed$1" "${@:4}"
+  echo --seed "$1" --alpha "$2" --demos-rl "$RUNS/expert_seed$1/demos" --demos-human "$RUNS/human_seed$1" --run-dir "$RUNS/$3_seed$1" "${@:4}"
 }
 {
   for alpha in $MIXED; do

@@ -3,8 +3,8 @@
     python benchmark/torcs_report.py        # runs/torcs -> benchmark/results/torcs
 
 Takes whatever part of the runs of `benchmark/torcs_alpha.sh` is done, and says which. The score is that of Table 2.3:
-metres in windows of 5 s times 3.6, 0 for a window with a crash, as the mean of each episode; intervals are 95%
-t-intervals of the seeds' means.
+metres in windows of 5 s times 3.6 as the mean of each episode, 0 for the window with a crash or standstill, behind which
+there are none; intervals are 95% t-intervals of the seeds' means.
 """
 
 import json
@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from cleanrl_thesis import gail_hybrid as gail
 
 MODES = ("sampled", "greedy")
-EXPERTS = {"rl": "DDPG", "human": "human"}
+EXPERTS = {"expert": "DDPG", "human": "human"}  # folders whose demonstrations are what the students learned from
 BEFORE = 60.0  # m before a curve, where its braking is measured from
 TREMBLE = 0.05  # a turn of the wheel by less of its lock is not counted as a change
 
@@ -38,54 +38,62 @@ class Args:
 
 
 def read_runs(folder: Path) -> list[dict]:
-    """A row for every finished run and way to act, and for both experts as each student had them."""
+    """A row for every finished run and way to act, and for the demonstrations of each seed's experts."""
     rows = []
-    for path in sorted(folder.glob("*/result.json")):
+    for path in sorted(folder.glob("*_seed*/result.json")):
         result, args = json.loads(path.read_text()), json.loads((path.parent / "args.json").read_text())
-        if not result["complete"] or "driving" not in json.dumps(result["evaluation"]):
+        if not result["complete"]:
             continue
-        kind = re.sub(r"_seed\d+$", "", path.parent.name)
         is_student = "greedy" in result["evaluation"]
-        evaluations = result["evaluation"] if is_student else {"without noise": result["evaluation"]}
-        evaluations = {(kind, mode): numbers for mode, numbers in evaluations.items()}
-        if is_student:
-            evaluations |= {(EXPERTS[name], "demonstrations"): part for name, part in result["experts"].items()}
-        for (name, mode), numbers in evaluations.items():
-            driving = numbers["driving"]
-            rows.append(
-                {
-                    "kind": name,
-                    "seed": result["seed"],
-                    "of_run": path.parent.name,
-                    "alpha": args.get("alpha", ""),
-                    "mode": mode,
-                    "episodes": numbers["episodes"],
-                    **{key: round(driving["score"][key], 2) for key in ("mean", "std", "min", "max")},
-                    "metres_in_5_s": round(driving["metres_in_5_s"]["mean"], 2),
-                    "crashes": driving["crashes"],
-                    "mean_laps": round(float(np.mean(driving["laps"])), 3),
-                    "steps": result["global_step"],
-                    "training_seconds": round(result["training_seconds"]),
-                    "script_sha256": result["script_sha256"][:12],
-                }
-            )
+        evaluations = result["evaluation"] if is_student else {"evaluation": result["evaluation"]}
+        run = {"alpha": args.get("alpha", ""), "steps": result["global_step"]}
+        run |= {"training_seconds": round(result["training_seconds"]), "script_sha256": result["script_sha256"][:12]}
+        rows += [run_row(path.parent, mode, numbers["driving"], run) for mode, numbers in evaluations.items()]
+    for path in sorted(folder.glob("*_seed*/manifest.json")) + sorted(folder.glob("expert_seed*/demos/manifest.json")):
+        run = path.parent.parent if path.parent.name == "demos" else path.parent
+        if run == path.parent or (run / "result.json").exists():
+            track = gail.Track(*gail.TRACKS[json.loads(path.read_text())["options"]["track"]])
+            driving = gail.driving_scores(read_episodes(path.parent, 10_000), track.length)
+            rows.append(run_row(run, "demonstrations", driving, {}))
     return rows
 
 
+def run_row(folder: Path, mode: str, driving: dict, run: dict) -> dict:
+    """What is kept of a run's scores; `run` is empty for demonstrations."""
+    kind, seed = folder.name.rsplit("_seed", 1)
+    return {
+        "kind": kind,
+        "seed": int(seed),
+        "alpha": run.get("alpha", ""),
+        "mode": mode,
+        "episodes": len(driving["laps"]),
+        **{key: round(driving["score"][key], 2) for key in ("mean", "std", "min", "max")},
+        "metres_in_5_s": round(driving["metres_in_5_s"]["mean"], 2),
+        "crashes": driving["crashes"],
+        "standstills": driving["standstills"],
+        "mean_laps": round(float(np.mean(driving["laps"])), 3),
+        "steps": run.get("steps", ""),
+        "training_seconds": run.get("training_seconds", 0),
+        "script_sha256": run.get("script_sha256", ""),
+    }
+
+
 def select(rows: list[dict], kind: str, mode: str) -> list[dict]:
-    """One row for each seed; the experts' are the same in every run that was given them."""
-    found = {row["seed"]: row for row in rows if row["kind"] == kind and row["mode"] == mode}
-    return [found[seed] for seed in sorted(found)]
+    """A row for each seed."""
+    return [row for row in rows if row["kind"] == kind and row["mode"] == mode]
 
 
 def table_2_3(rows: list[dict]) -> str:
     """Table 2.3, published beside measured."""
     published = published_table("table_2_3.csv")
-    share = float(published["DDPG"]["avg"])
-    lines = ["| driver | | seeds | max | min | avg | std | of DDPG's | crashed | laps in 60 s |", "|---|" + "---|" * 9]
-    expert, _ = interval([row["mean"] for row in select(rows, "DDPG", "demonstrations")])
+    best = float(published["DDPG"]["avg"])
+    lines = [
+        "| driver | | seeds | max | min | avg | std | of DDPG's | ended early | laps in 60 s |",
+        "|---|" + "---|" * 9,
+    ]
+    expert, _ = interval([row["mean"] for row in select(rows, "expert", "demonstrations")])
     groups = {
-        "DDPG": [("demonstrations", "DDPG")],
+        "DDPG": [("demonstrations", "expert"), ("evaluation", "expert")],
         "hybrid, α = 0.5": [(mode, "alpha0.5") for mode in MODES],
         "human": [("demonstrations", "human")],
         "GAIL, α = 0": [(mode, "alpha0.0") for mode in MODES],
@@ -98,17 +106,18 @@ def table_2_3(rows: list[dict]) -> str:
         if name in published:
             cells = [published[name][key] for key in ("max", "min", "avg", "std")]
             lines.append(
-                f"| {name} | **published** | | {' | '.join(cells)} | {float(published[name]['avg']) / share:.2f} | | |"
+                f"| {name} | **published** | | {' | '.join(cells)} | {float(published[name]['avg']) / best:.2f} | | |"
             )
         for mode, kind in group:
             found = select(rows, kind, mode)
             if found:
                 extremes = [f"{max(row['max'] for row in found):.0f}", f"{min(row['min'] for row in found):.0f}"]
                 means = [with_interval([row[key] for row in found], 1) for key in ("mean", "std")]
-                crashed = sum(row["crashes"] for row in found) / sum(row["episodes"] for row in found)
+                ended = sum(row["crashes"] + row["standstills"] for row in found)
+                share = ended / sum(row["episodes"] for row in found)
                 ratio = f"{np.mean([row['mean'] for row in found]) / expert:.2f}"
                 laps = f"{np.mean([row['mean_laps'] for row in found]):.2f}"
-                cells = (name, mode, len(found), *extremes, *means, ratio, f"{100 * crashed:.0f}%", laps)
+                cells = (name, mode, len(found), *extremes, *means, ratio, f"{100 * share:.0f}%", laps)
                 lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines) + "\n"
 
@@ -136,7 +145,7 @@ def figure_2_8(rows: list[dict]) -> Figure:
     """Score over α as a share of the DDPG expert's, with the published ones."""
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axes = figure.subplots()
-    expert, _ = interval([row["mean"] for row in select(rows, "DDPG", "demonstrations")])
+    expert, _ = interval([row["mean"] for row in select(rows, "expert", "demonstrations")])
     human, _ = interval([row["mean"] for row in select(rows, "human", "demonstrations")])
     for mode, colour in zip(MODES, ("tab:blue", "tab:orange")):
         curve = alpha_curve(rows, mode)
@@ -232,21 +241,27 @@ def habits(episodes: list[dict[str, np.ndarray]], track) -> dict[str, float]:
         if (episode["rewards"] == -1).any():
             crashes += 1
             ways = (parked - place[-1] + 8) % track.length - 8
-            into_cars += bool((np.abs(ways) < gail.CAR_LENGTH + 1).any())
+            on_road = abs(trace["left"][-1]) <= track.half_width
+            into_cars += bool(on_road and (np.abs(ways) < gail.CAR_LENGTH + 1).any())
     means = {name: float(np.mean(values)) for name, values in found.items()}
-    return {**means, "changes": changes * gail.FPS / steps, "crashes": crashes, "into cars": into_cars}
+    return {
+        **means,
+        "changes": changes * gail.FPS / steps,
+        "episodes": len(episodes),
+        "crashes": crashes,
+        "into cars": into_cars,
+    }
 
 
 def drivers(folder: Path, most: int) -> dict[str, list[list[dict[str, np.ndarray]]]]:
-    """Demonstrations of each driver, a list for each seed that has some."""
-    found = defaultdict(list)
+    """Demonstrations of each driver, a list for each finished run that has some."""
+    found = {name: [] for name in EXPERTS.values()}
     for run in sorted(folder.glob("*_seed*")):
-        kind = re.sub(r"_seed\d+$", "", run.name)
-        found["DDPG" if kind == "expert" else kind].append(read_episodes(run / "demos", most))
-        if kind == "alpha0.0":
-            found["human"].append(read_episodes(run / "demos_synthetic_human", most))
-    names = ["human", "DDPG", *sorted(found.keys() - {"human", "DDPG"})]
-    return {name: kept for name in names if (kept := [episodes for episodes in found[name] if episodes])}
+        kind = run.name.rsplit("_seed", 1)[0]
+        if kind == "human" or (run / "result.json").exists():
+            episodes = read_episodes(run if kind == "human" else run / "demos", most)
+            found.setdefault(EXPERTS.get(kind, kind), []).extend([episodes] if episodes else [])
+    return {name: seeds for name, seeds in found.items() if seeds}
 
 
 def habit_tables(folder: Path, most: int) -> str:
@@ -260,10 +275,13 @@ def habit_tables(folder: Path, most: int) -> str:
         "gap": "gap to parked cars, m",
         "changes": "wheel turned back, per s",
     }
-    lines = [f"| driver | seeds | {' | '.join(columns.values())} | crashes | of them into cars |", "|---|" + "---|" * 8]
+    lines = [
+        f"| driver | seeds | {' | '.join(columns.values())} | episodes | crashes | of them into cars |",
+        "|---|" + "---|" * 9,
+    ]
     for name, seeds in measured.items():
         cells = [with_interval([habit[key] for habit in seeds if key in habit], 1) for key in columns]
-        sums = [sum(habit[key] for habit in seeds) for key in ("crashes", "into cars")]
+        sums = [sum(habit[key] for habit in seeds) for key in ("episodes", "crashes", "into cars")]
         lines.append(f"| {name} | {len(seeds)} | {' | '.join(map(str, [*cells, *sums]))} |")
     lines += ["", "Share of passes on the left of each parked car, by its way from the start line:", ""]
     lines += [f"| driver | {' | '.join(f'{way} m' for way in gail.PARKED)} |", "|---|" + "---|" * len(gail.PARKED)]
@@ -275,7 +293,7 @@ def habit_tables(folder: Path, most: int) -> str:
 
 def provenance(rows: list[dict]) -> str:
     """What the results rest on."""
-    own = [row for row in rows if row["mode"] in ("greedy", "without noise")]
+    own = [row for row in rows if row["mode"] in ("greedy", "evaluation")]
     hours = sum(row["training_seconds"] for row in own) / 3600
     scripts = {"ddpg_torcs_like": "expert", "gail_hybrid": "alpha"}
     made_at = []

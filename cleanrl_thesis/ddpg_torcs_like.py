@@ -1,7 +1,7 @@
 """DDPG on a driving task: the reinforcement learning expert of the hybrid by GAIL (thesis section 2.4.3).
 
     python cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220      # the expert, for gail_hybrid.py
-    python cleanrl_thesis/ddpg_torcs_like.py --track hills --noise ou
+    python cleanrl_thesis/ddpg_torcs_like.py --track-name hills --noise ou
     python cleanrl_thesis/ddpg_torcs_like.py --env-id Pendulum-v1 --total-timesteps 50000 --num-envs 1 --frame-skip 1
 
 Tasks: the simulator, which is built in (`gymnasium.make("cleanrl_thesis.ddpg_torcs_like:TorcsLike-v0")`), and any
@@ -15,14 +15,15 @@ after every crash: on the same machine the run ends with the same bytes.
 | both annealed to 0 | on | ours; Baselines' are constant |
 | γ, τ, batch, L2 of the critic, layer norm | 0.99, 0.01, 64, 1e-2, on | OpenAI Baselines' defaults |
 | observations | normalised by running statistics, clipped to 5 deviations of at least 0.1 | OpenAI Baselines' defaults |
-| updates | 50 after every 100 steps | OpenAI Baselines' defaults |
+| updates | 50 after every 100 steps | OpenAI Baselines' defaults; with held actions that is 5 times as many for each action |
 | noise | on the parameters, adapted to an action distance of 0.2 | OpenAI Baselines' defaults |
 | network | 64-64 with ReLU, the action enters the critic's second layer | OpenAI Baselines' defaults |
 | an action | held for 5 steps, 0.1 s; the reward is scaled by 0.1 | ours; Baselines has 1 and 1 |
 | cars side by side | 10, each with a perturbed actor of its own, drawn anew every 10 s; from all of the noise for the first to none for the last | ours; Baselines has one |
 
 The driving task stands in for TORCS with the wrapper of the study: the same 65 observations, two actions and rewards, a
-car with the numbers of TORCS' car1-trb1, and roads of the same length, width and least radius as TORCS' tracks.
+car with the numbers of TORCS' car1-trb1, and roads of the same length, width and least radius as TORCS' tracks (but
+15 m for 12.2 m in `city`). It is flat, so the vertical speed that is observed is always 0.
 """
 
 # /// script
@@ -138,7 +139,7 @@ class Args:
     anneal_lr: bool = True
     """anneal both learning rates linearly to 0; off: constant (Baselines)"""
     critic_l2: float = 1e-2
-    """weight of half the squared weights of the critic's hidden layers in its loss (Baselines)"""
+    """weight of half the squared weights of the critic's two hidden layers in its loss (Baselines has three)"""
     hidden_size: int = 64
     """units in each of the two hidden layers (Baselines)"""
     layer_norm: bool = True
@@ -836,7 +837,7 @@ class Agent(nn.Module):
 
 
 def small_output(layer: nn.Linear) -> nn.Linear:
-    """Begin with outputs near 0 (Baselines)."""
+    """Begin with outputs near 0."""
     nn.init.uniform_(layer.weight, -3e-3, 3e-3)
     nn.init.uniform_(layer.bias, -3e-3, 3e-3)
     return layer
@@ -878,7 +879,7 @@ def episode_seeds(seed: int, stream: int, block: int) -> list[int]:
 
 
 def episode_seed(seed: int, stream: int, episode: int) -> int:
-    """Seed of an episode: sub-environment `stream` of run `seed`, or one of the two streams that are not trained on."""
+    """Seed of an episode: sub-environment `stream` of run `seed`, or one of the streams that are not trained on."""
     return episode_seeds(seed, stream, episode // 256)[episode % 256]
 
 
@@ -1559,20 +1560,28 @@ def play(policy, games: gym.vector.VectorEnv, seeds: list[int], keep: bool = Fal
     return episodes
 
 
-def window_scores(rewards: np.ndarray) -> list[float]:
-    """Metres in each window of 5 s of an episode, 0 for that of a crash; a last one that is cut short is left out."""
+def window_scores(rewards: np.ndarray, terminated: bool) -> list[float]:
+    """Metres in each window of 5 s of an episode, 0 for the last one of an episode that a crash or standstill ended.
+
+    A window that is cut short by the end of the time is left out, and there are none behind an end.
+    """
     windows = [rewards[start : start + WINDOW] for start in range(0, len(rewards), WINDOW)]
-    scores = [0.0 if (window == -1).any() else float(window.sum()) for window in windows]
-    return scores if len(windows[-1]) == WINDOW or (windows[-1] == -1).any() else scores[:-1]
+    scores = [float(window.sum()) for window in windows]
+    if terminated:
+        return [*scores[:-1], 0.0]
+    return scores if len(windows[-1]) == WINDOW else scores[:-1]
 
 
 def driving_scores(episodes: list[dict[str, np.ndarray]], length: float) -> dict:
-    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s; crashes, and laps of each."""
-    means = [float(np.mean(scores)) for scores in (window_scores(e["rewards"]) for e in episodes) if scores]
+    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s; crashes, other early ends, and laps of each."""
+    windows = [window_scores(episode["rewards"], bool(episode["terminated"])) for episode in episodes]
+    means = [float(np.mean(scores)) for scores in windows if scores]
+    crashes = sum((episode["rewards"] == -1).any() for episode in episodes)
     return {
         "metres_in_5_s": summary(means),
         "score": summary([mean * 3.6 for mean in means]),
-        "crashes": int(sum((episode["rewards"] == -1).any() for episode in episodes)),
+        "crashes": int(crashes),
+        "standstills": int(sum(episode["terminated"] for episode in episodes) - crashes),
         "laps": [float(episode["rewards"][episode["rewards"] != -1].sum() / length) for episode in episodes],
     }
 
@@ -1642,7 +1651,8 @@ def save_demonstrations(policy, args: Args, run_dir: Path) -> None:
     """Write `--save-demos` episodes of the actor without noise into `demos/`."""
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
     episodes = play(held(policy, args.frame_skip), make_games(args, len(seeds)), seeds, keep=True)
-    about = {"env_id": args.env_id, "options": env_options(args), "player": args.exp_name, "mode": "without noise"}
+    options = {**env_options(args), "reward": "distance"} if is_driving(args.env_id) else {}
+    about = {"env_id": args.env_id, "options": options, "player": args.exp_name, "mode": "without noise"}
     write_demonstrations(run_dir / "demos", episodes, about)
 
 
@@ -1707,7 +1717,8 @@ def print_table(result: dict) -> None:
         numbers = "".join(f"{row[key]:>11.1f}" for key in ("mean", "std", "min", "max") if row[key] is not None)
         print(f"{name:32}{row['episodes']:>9}{numbers}")
     if driving:
-        print(f"{driving['crashes']} crashes; laps from {min(driving['laps']):.2f} to {max(driving['laps']):.2f}")
+        ends = f"{driving['crashes']} crashes, {driving['standstills']} standstills"
+        print(f"{ends}; laps from {min(driving['laps']):.2f} to {max(driving['laps']):.2f}")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

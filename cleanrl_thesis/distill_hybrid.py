@@ -483,7 +483,7 @@ def episode_seeds(seed: int, stream: int, block: int) -> list[int]:
 
 
 def episode_seed(seed: int, stream: int, episode: int) -> int:
-    """Seed of an episode: sub-environment `stream` of run `seed`, or one of the two streams that are not trained on."""
+    """Seed of an episode: sub-environment `stream` of run `seed`, or one of the streams that are not trained on."""
     return episode_seeds(seed, stream, episode // 256)[episode % 256]
 
 

@@ -20,7 +20,9 @@ agent, and not yet calibrated to Table 2.3, where it is to the expert as 637 to 
 | KL bound, discriminator's learning rate | 0.01, 1e-3 | section 2.4.3 |
 | networks | two layers of 100 with tanh, for policy, values and discriminator | the study's code |
 | batch | 1,024 steps for GAIL, else 512; 3 policy updates for one of the discriminator | the study's code |
-| Fisher matrix | from every fifth step of a batch | OpenAI Baselines' |
+| Fisher matrix | from a fifth of a batch | OpenAI Baselines' |
+| environments side by side | 16, each for a share of the batch | ours; the study's code has one |
+| actions that the discriminator sees | within the bounds | ours; the study's code shows them as sampled |
 | CG iterations, damping; γ, λ; passes over the value function, rate; entropies | 10, 0.1; 0.995, 0.97; 5, 1e-3; 0, 1e-3 | the study's code |
 | which label is the expert's | D → 0 | Eq. 2.3.1; the prose and the study's code have D and 1 − D swapped |
 | normalisation of observations | mean and deviation of the demonstrations, fixed | ours; the study's code keeps running ones |
@@ -125,9 +127,10 @@ class Args:
     brake: bool = True
     """TorcsLike-v0: negative throttle brakes; off: it coasts, as in gym_torcs"""
     demos_rl: Path | None = None
-    """folder of the RL expert's demonstrations; needed for α > 0"""
+    """folder of the RL expert's demonstrations; needed for α > 0, and not read for α = 0"""
     demos_human: Path | None = None
-    """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_synthetic_human/`"""
+    """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_synthetic_human/`; not
+    read for α = 1"""
     human_episodes: int = 220
     """episodes of 60 s of the synthetic human (section 2.4.3)"""
     alpha: float = 0.5
@@ -159,7 +162,7 @@ class Args:
     cg_damping: float = 0.1
     """multiple of the identity that is added to the Fisher matrix"""
     fisher_every: int = 5
-    """which steps of a batch the Fisher matrix is estimated from: every fifth (Baselines)"""
+    """the Fisher matrix is estimated from one in so many steps of a batch, drawn at random (Baselines takes every fifth)"""
     gamma: float = 0.995
     """discount factor γ"""
     gae_lambda: float = 0.97
@@ -919,6 +922,7 @@ def read_episode(path: Path, checksum: str, env: gym.Env, flag: str) -> dict[str
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             observations, actions, rewards = arrays["observations"], arrays["actions"], arrays["rewards"]
+            terminated = bool(arrays["terminated"])
     except (KeyError, ValueError, TypeError, zipfile.BadZipFile, EOFError, OSError) as error:
         raise UsageError(f"{flag} {path}: no demonstration: {first_line(error)}") from None
     obs_dim, action_dim = env.observation_space.shape[0], env.action_space.shape[0]
@@ -929,7 +933,7 @@ def read_episode(path: Path, checksum: str, env: gym.Env, flag: str) -> dict[str
         finite = np.issubdtype(array.dtype, np.number) and bool(np.isfinite(array).all())
         require(finite, flag, path, f"{name} must be finite numbers")
     require(rewards.shape == (len(actions),), flag, path, "rewards must be (T,)")
-    return {"observations": observations, "actions": actions, "rewards": rewards}
+    return {"observations": observations, "actions": actions, "rewards": rewards, "terminated": terminated}
 
 
 def read_demonstrations(folder: Path, args: Args, flag: str) -> list[dict[str, np.ndarray]]:
@@ -985,6 +989,7 @@ class Experts(NamedTuple):
 # ---------------------------------------------------------------------------------------------------------------------
 EVALUATION_STREAM, DEMONSTRATION_STREAM = 1_000_000, 1_000_001
 HUMAN_STREAM = 1_000_002
+STUDENT_STREAM = 1_000_003  # other episodes than the experts' demonstrations
 
 
 def bounded(x: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:
@@ -999,7 +1004,7 @@ def episode_seeds(seed: int, stream: int, block: int) -> list[int]:
 
 
 def episode_seed(seed: int, stream: int, episode: int) -> int:
-    """Seed of an episode: sub-environment `stream` of run `seed`, or one of the two streams that are not trained on."""
+    """Seed of an episode: sub-environment `stream` of run `seed`, or one of the streams that are not trained on."""
     return episode_seeds(seed, stream, episode // 256)[episode % 256]
 
 
@@ -1236,13 +1241,16 @@ DISCRIMINATOR_METRICS = ("losses/l_mix", *(f"discriminator/accuracy_{name}" for 
 def discriminator_loss(
     student: torch.Tensor, rl: torch.Tensor, human: torch.Tensor, alpha: float, ent_coef: float
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """−L_mix (Eq. 2.3.1) less the entropy, of the logits of D, (M,), for steps of the student and of both experts."""
+    """−L_mix (Eq. 2.3.1) less the entropy, of the logits of D, (M,), for steps of the student and of both experts.
+
+    Student and experts count the same in the entropy, the experts by their weights.
+    """
     # D makes Eq. 2.3.1 large: D → 1 for the student, D → 0 for experts. The prose of section 2.3.2 and of Q&A 1 says
     # "minimise over w", and the study's code labels experts 1: both have D and 1 − D swapped, and are the same game.
     l_mix = F.logsigmoid(student).mean()
     l_mix = l_mix + alpha * F.logsigmoid(-rl).mean() + (1 - alpha) * F.logsigmoid(-human).mean()
-    logits = torch.cat([student, rl, human])
-    entropy = (F.softplus(logits) - torch.sigmoid(logits) * logits).mean()
+    entropies = [(F.softplus(x) - torch.sigmoid(x) * x).mean() for x in (student, rl, human)]
+    entropy = 0.5 * entropies[0] + 0.5 * (alpha * entropies[1] + (1 - alpha) * entropies[2])
     accuracies = {"student": (student > 0), "rl": (rl < 0), "human": (human < 0)}
     metrics = {f"discriminator/accuracy_{name}": hits.float().mean() for name, hits in accuracies.items()}
     return -l_mix - ent_coef * entropy, {"losses/l_mix": l_mix.detach(), **metrics}
@@ -1375,7 +1383,8 @@ def trpo_step(policy: PolicyVector, batch: Batch, args: Args) -> dict[str, float
     gradient = torch.func.grad(objective)(old)
     before = objective(old)
 
-    multiply = fisher_product(policy, old, batch.obs[:: args.fisher_every], args.cg_damping)
+    some = torch.randperm(len(batch.obs), device=old.device)[:: args.fisher_every]
+    multiply = fisher_product(policy, old, batch.obs[some], args.cg_damping)
     direction = conjugate_gradient(multiply, gradient, args.cg_iterations)
     full = direction * torch.sqrt(2 * args.max_kl / (direction @ multiply(direction)).clamp(min=1e-12))
     for halvings in range(10):
@@ -1637,20 +1646,28 @@ def play(policy, games: gym.vector.VectorEnv, seeds: list[int], keep: bool = Fal
     return episodes
 
 
-def window_scores(rewards: np.ndarray) -> list[float]:
-    """Metres in each window of 5 s of an episode, 0 for that of a crash; a last one that is cut short is left out."""
+def window_scores(rewards: np.ndarray, terminated: bool) -> list[float]:
+    """Metres in each window of 5 s of an episode, 0 for the last one of an episode that a crash or standstill ended.
+
+    A window that is cut short by the end of the time is left out, and there are none behind an end.
+    """
     windows = [rewards[start : start + WINDOW] for start in range(0, len(rewards), WINDOW)]
-    scores = [0.0 if (window == -1).any() else float(window.sum()) for window in windows]
-    return scores if len(windows[-1]) == WINDOW or (windows[-1] == -1).any() else scores[:-1]
+    scores = [float(window.sum()) for window in windows]
+    if terminated:
+        return [*scores[:-1], 0.0]
+    return scores if len(windows[-1]) == WINDOW else scores[:-1]
 
 
 def driving_scores(episodes: list[dict[str, np.ndarray]], length: float) -> dict:
-    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s; crashes, and laps of each."""
-    means = [float(np.mean(scores)) for scores in (window_scores(e["rewards"]) for e in episodes) if scores]
+    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s; crashes, other early ends, and laps of each."""
+    windows = [window_scores(episode["rewards"], bool(episode["terminated"])) for episode in episodes]
+    means = [float(np.mean(scores)) for scores in windows if scores]
+    crashes = sum((episode["rewards"] == -1).any() for episode in episodes)
     return {
         "metres_in_5_s": summary(means),
         "score": summary([mean * 3.6 for mean in means]),
-        "crashes": int(sum((episode["rewards"] == -1).any() for episode in episodes)),
+        "crashes": int(crashes),
+        "standstills": int(sum(episode["terminated"] for episode in episodes) - crashes),
         "laps": [float(episode["rewards"][episode["rewards"] != -1].sum() / length) for episode in episodes],
     }
 
@@ -1724,7 +1741,7 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 
 def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
     """Write `--save-demos` episodes of the student into `demos/`."""
-    seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
+    seeds = [episode_seed(args.seed, STUDENT_STREAM, i) for i in range(args.save_demos)]
     policy = make_policy(agent, args.eval_mode, make_env(args.env_id, **env_options(args)).action_space, args.seed)
     episodes = play(policy, make_games(args, len(seeds)), seeds, keep=True)
     about = {"player": f"{args.exp_name}, alpha {args.alpha}", "mode": args.eval_mode}
@@ -1814,19 +1831,19 @@ def start_wandb(args: Args, run_dir: Path) -> None:
 
 
 def human_episodes(args: Args) -> list[dict[str, np.ndarray]]:
-    """Episodes of the recorded or of the synthetic human; none where they are not needed. Raises UsageError."""
-    if args.demos_human is not None:
-        return read_demonstrations(args.demos_human, args, "--demos-human")
+    """Episodes of the recorded or of the synthetic human; none where they have no weight. Raises UsageError."""
     if args.alpha == 1:
         return []
+    if args.demos_human is not None:
+        return read_demonstrations(args.demos_human, args, "--demos-human")
     seeds = [episode_seed(args.seed, HUMAN_STREAM, i) for i in range(args.human_episodes)]
     games = TorcsLikeVectorEnv(len(seeds), **env_options(args))
     return play(SyntheticDriver(games.cars, args.seed), games, seeds, keep=True)
 
 
 def rl_episodes(args: Args) -> list[dict[str, np.ndarray]]:
-    """Episodes of the RL expert, if any. Raises UsageError."""
-    return [] if args.demos_rl is None else read_demonstrations(args.demos_rl, args, "--demos-rl")
+    """Episodes of the RL expert; none where they have no weight. Raises UsageError."""
+    return [] if args.alpha == 0 else read_demonstrations(args.demos_rl, args, "--demos-rl")
 
 
 def behaviour_cloning(agent: Agent, experts: Experts, args: Args) -> None:
@@ -1868,6 +1885,7 @@ def main(args: Args) -> int:
     if human and args.demos_human is None:
         about = {"env_id": args.env_id, "options": env_options(args), "player": "synthetic human", "mode": "scripted"}
         write_demonstrations(run_dir / "demos_synthetic_human", human, about)
+    del human, rl  # the arrays are in `experts` now
 
     random.seed(args.seed)  # this file draws from neither; for environments that do
     np.random.seed(args.seed)
@@ -1891,7 +1909,9 @@ def main(args: Args) -> int:
     iteration, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}
     round_metrics: dict[str, float] = dict.fromkeys(DISCRIMINATOR_METRICS, math.nan)
     if checkpoint is None:
+        start = time.perf_counter()
         behaviour_cloning(agent, experts, args)
+        training_seconds = time.perf_counter() - start
         players.start()
     else:
         iteration, training_seconds = checkpoint["iteration"], checkpoint["training_seconds"]

@@ -179,6 +179,9 @@ def test_habits_of_a_car_whose_way_is_known():
     gaps = [abs(2 - left * track.half_width) - torcs.gail.CAR_WIDTH for left in torcs.gail.PARKED_LEFT[:2]]
     assert found["gap"] == pytest.approx(np.mean(gaps), abs=1e-5)
     assert (found["left of 0"], found["left of 1"], found["changes"], found["crashes"]) == (0, 1, 0, 0)
-    crash = {**episode, "rewards": np.append(episode["rewards"][:-1], -1)}
-    found = torcs.habits([crash], track)
-    assert found["crashes"] == 1 and found["into cars"] == 0
+    for steps, left, into_cars in ((200, 2, 0), (250, 2, 1), (250, -9, 0)):  # at 277 and 297 m; a car stands at 300 m
+        crash = {name: array[:steps].copy() for name, array in episode.items()}
+        crash["rewards"][-1], observations[steps, 20] = -1, left / track.half_width
+        crash["observations"] = observations[: steps + 1]
+        found = torcs.habits([crash], track)
+        assert (found["crashes"], found["into cars"]) == (1, into_cars), (steps, left)

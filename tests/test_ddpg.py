@@ -181,7 +181,7 @@ def test_the_noise_falls_from_the_first_environment_to_the_last(kind):
 
 @pytest.mark.parametrize("kind", ["gaussian", "ou", "none"])
 def test_noise_on_actions(kind):
-    """Deviations: of a Gaussian as given; of the Ornstein-Uhlenbeck process 0.1 σ / √(1 − (1 − 0.0015)²)."""
+    """Deviations: of a Gaussian as given; of the Ornstein-Uhlenbeck process' steps 0.1 σ, beside the pull to 0."""
     args, _, optimizer, *_ = make(noise=kind, noise_ladder=False)
     noise = ddpg.ActionNoise(optimizer, args, ACTIONS, np.random.default_rng(0))
     obs = np.zeros((3, OBS), np.float32)
@@ -269,16 +269,19 @@ def test_cars_have_seeds_of_their_own_and_are_restored():
 
 # Scores
 def test_window_scores_by_hand():
-    """Windows of 250 steps: whole, of a crash, cut short."""
+    """Windows of 250 steps: whole, of a crash, cut short; one who stands still from the start has 0."""
     drive = np.full(600, 0.5)
-    assert ddpg.window_scores(drive) == [125.0, 125.0]
+    assert ddpg.window_scores(drive, False) == [125.0, 125.0]
     crash = np.append(drive[:400], -1.0)
-    assert ddpg.window_scores(crash) == [125.0, 0.0]
-    assert ddpg.window_scores(np.array([0.5, -1.0])) == [0.0]
-    assert ddpg.window_scores(np.full(20, 0.5)) == []
-    scores = ddpg.driving_scores([{"rewards": drive}, {"rewards": crash}], 100.0)
-    assert scores["metres_in_5_s"]["mean"] == (125 + 62.5) / 2 and scores["score"]["max"] == 450
-    assert scores["crashes"] == 1 and scores["laps"] == [3.0, 2.0]
+    assert ddpg.window_scores(crash, True) == [125.0, 0.0]
+    assert ddpg.window_scores(drive[:500], True) == [125.0, 0.0]
+    assert ddpg.window_scores(np.array([0.5, -1.0]), True) == [0.0]
+    assert ddpg.window_scores(np.full(20, 0.5), False) == []
+    stands = np.zeros(51)
+    episodes = [(drive, False), (crash, True), (stands, True)]
+    scores = ddpg.driving_scores([{"rewards": r, "terminated": np.array(t)} for r, t in episodes], 100.0)
+    assert scores["metres_in_5_s"]["mean"] == (125 + 62.5 + 0) / 3 and scores["score"]["max"] == 450
+    assert (scores["crashes"], scores["standstills"], scores["laps"]) == (1, 1, [3.0, 2.0, 0.0])
 
 
 def test_actions_are_scaled_to_the_bounds():

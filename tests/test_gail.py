@@ -124,7 +124,8 @@ def test_discriminator_loss_against_the_equation(alpha):
     d = [[1 / (1 + math.exp(-logit)) for logit in part.tolist()] for part in (student, rl, human)]
     l_mix = sum(math.log(x) for x in d[0]) / 20
     l_mix += alpha * sum(math.log(1 - x) for x in d[1]) / 20 + (1 - alpha) * sum(math.log(1 - x) for x in d[2]) / 20
-    entropy = -sum(x * math.log(x) + (1 - x) * math.log(1 - x) for part in d for x in part) / 60
+    parts = [-sum(x * math.log(x) + (1 - x) * math.log(1 - x) for x in part) / 20 for part in d]
+    entropy = 0.5 * parts[0] + 0.5 * (alpha * parts[1] + (1 - alpha) * parts[2])
     assert metrics["losses/l_mix"].item() == pytest.approx(l_mix, rel=1e-5)
     assert loss.item() == pytest.approx(-l_mix - 0.01 * entropy, rel=1e-5)
     assert list(metrics) == list(gail.DISCRIMINATOR_METRICS)

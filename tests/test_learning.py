@@ -3,13 +3,16 @@
 import json
 
 import pytest
-from conftest import run
+from conftest import ROOT, SCRIPT, run
 
 pytestmark = pytest.mark.slow
 
 
-def evaluation(folder, *flags) -> float:
-    run(*flags, "--compile", "--eval-episodes", 20, "--run-dir", "run", cwd=folder)
+DDPG, GAIL = ROOT / "cleanrl_thesis" / "ddpg_torcs_like.py", ROOT / "cleanrl_thesis" / "gail_hybrid.py"
+
+
+def evaluation(folder, *flags, script=SCRIPT) -> float:
+    run(*flags, "--compile", "--eval-episodes", 20, "--run-dir", "run", cwd=folder, script=script)
     return json.loads((folder / "run" / "evaluation.json").read_text())["mean"]
 
 
@@ -30,3 +33,25 @@ def test_pendulum_swings_up_in_the_modern_setting(tmp_path):
     flags += ["--kl-samples", "batch", "--kl-timing", "after-iteration", "--rollback", "policy-moments"]
     flags += ["--num-envs", 8, "--gamma", 0.9, "--learning-rate", 1e-3]
     assert evaluation(tmp_path, "--env-id", "Pendulum-v1", "--total-timesteps", 300_000, *flags) > -400
+
+
+def test_ddpg_swings_a_pendulum_up(tmp_path):
+    """Random play gets about -1,200."""
+    flags = ["--env-id", "Pendulum-v1", "--total-timesteps", 40_000, "--num-envs", 1, "--frame-skip", 1]
+    assert evaluation(tmp_path, *flags, script=DDPG) > -300
+
+
+def test_ddpg_drives_past_the_first_parked_cars(tmp_path):
+    """A car that keeps straight on crashes after 100 m, one that follows the road after 300 m at most."""
+    assert evaluation(tmp_path, "--total-timesteps", 400_000, script=DDPG) > 320
+
+
+def test_gail_drives_as_far_as_the_synthetic_human(tmp_path):
+    """From its demonstrations alone; without learning the car stands still."""
+    flags = ["--alpha", 0, "--total-timesteps", 400_000, "--eval-episodes", 20, "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=GAIL)
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    human, student = (
+        part["driving"]["score"]["mean"] for part in (result["experts"]["human"], result["evaluation"]["greedy"])
+    )
+    assert student > 0.6 * human

@@ -278,7 +278,7 @@ def test_check_env():
 
 
 def test_single_and_vectorised_agree():
-    """10,000 steps of 5 cars: the same bytes, through the ends of episodes."""
+    """10,000 steps of 5 cars: the same bytes, through crashes and time-outs."""
     seeds = [11, 12, 13, 14, 15]
     vector = gym.make_vec(ENV_ID, num_envs=5, vectorization_mode="vector_entry_point")
     singles = [gym.make(ENV_ID) for _ in seeds]
@@ -290,6 +290,9 @@ def test_single_and_vectorised_agree():
         steering = obs[:, 0] * 6 - 0.5 * obs[:, 20] + rng.normal(0, 0.2, 5)
         pedal = np.where(slow, 0.02, 0.05 * (90 - 300 * obs[:, 21])) + rng.normal(0, 0.1, 5)
         actions = np.clip(np.stack([steering, pedal], 1), -1, 1).astype(np.float32)
+        if i % 500 == 499:  # time is nearly up
+            for env in (vector, *singles):
+                env.unwrapped.cars.steps += torcs.EPISODE_STEPS - 100
         obs, rewards, terminated, truncated, infos = vector.step(actions)
         for j, env in enumerate(singles):
             one = env.step(actions[j])
@@ -300,7 +303,7 @@ def test_single_and_vectorised_agree():
                 assert np.array_equal(one[0], infos["final_obs"][j])
                 one = env.reset()
             assert np.array_equal(one[0], obs[j])
-    assert ends["crashed"] > 5
+    assert ends["crashed"] > 5 and ends["truncated"] > 5
 
 
 def test_observations_by_hand():

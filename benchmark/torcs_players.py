@@ -1,0 +1,94 @@
+"""The synthetic driver beside the DDPG experts: how its numbers were chosen, and its demonstrations.
+
+    python benchmark/torcs_players.py --calibrate                              # runs/torcs -> benchmark/results/torcs
+    python benchmark/torcs_players.py --seed 1 --demos runs/torcs/human_seed1  # 220 episodes of 60 s
+
+`--calibrate` measures the driver at several values of its boldness, the one number that was fitted: its score is to stand
+to the experts' as 637 to 819 (Table 2.3), and it is not to crash, for the people of Table 2.3 never scored below 588.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from apple_players import ROOT, commit, published_table
+from apple_report import write_csv
+
+from cleanrl_thesis import gail_hybrid as gail
+
+
+@dataclass
+class Args:
+    seed: int = 1
+    """seed of the driver and of its episodes"""
+    episodes: int = 220
+    """episodes of 60 s"""
+    demos: Path | None = None
+    """write the episodes as demonstrations into this folder, and nothing else"""
+    calibrate: bool = False
+    """also measure other values of the boldness"""
+    runs: Path = Path("runs/torcs")
+    """folder with the experts, expert_seed*"""
+    out: Path = ROOT / "benchmark" / "results" / "torcs"
+    """folder for the tables"""
+
+
+def drive(boldness: float, args: Args) -> list[dict[str, np.ndarray]]:
+    """Episodes of the driver at a boldness."""
+    driver = type("Driver", (gail.SyntheticDriver,), {"boldness": boldness})
+    seeds = [gail.episode_seed(args.seed, gail.HUMAN_STREAM, i) for i in range(args.episodes)]
+    games = gail.TorcsLikeVectorEnv(args.episodes)
+    return gail.play(driver(games.cars, args.seed), games, seeds, keep=True)
+
+
+def write_demonstrations(args: Args) -> None:
+    args.demos.mkdir(parents=True, exist_ok=True)
+    about = {"env_id": "TorcsLike-v0", "options": gail.env_options(gail.Args()), "player": "synthetic human"}
+    about |= {"mode": "scripted"}
+    gail.write_demonstrations(args.demos, drive(gail.SyntheticDriver.boldness, args), about)
+
+
+def row(name: str, scores: dict, expert: float) -> dict:
+    """A line of the table."""
+    numbers = {key: round(scores["score"][key], 1) for key in ("mean", "std", "min", "max")}
+    ratio = round(scores["score"]["mean"] / expert, 3)
+    return {
+        "driver": name,
+        "episodes": len(scores["laps"]),
+        **numbers,
+        "of DDPG's": ratio,
+        "crashes": scores["crashes"],
+    }
+
+
+def main(args: Args) -> None:
+    if args.demos is not None:
+        return write_demonstrations(args)
+    results = [json.loads(path.read_text()) for path in sorted(args.runs.glob("expert_seed*/result.json"))]
+    if not results:
+        raise SystemExit(f"--runs {args.runs}: holds no finished expert_seed*, to compare with")
+    experts = [result["evaluation"]["driving"] for result in results]
+    expert = float(np.mean([scores["score"]["mean"] for scores in experts]))
+    length = gail.Track(*gail.TRACKS["meadow"]).length
+    chosen = gail.SyntheticDriver.boldness
+    others = [0.85, 0.9, 0.95, 1.0, 1.05] if args.calibrate else []
+    rows = [row(f"DDPG, seed {result['seed']}", scores, expert) for result, scores in zip(results, experts)]
+    for boldness in sorted({chosen, *others}):
+        scores = gail.driving_scores(drive(boldness, args), length)
+        rows.append(row(f"boldness {boldness}{' (chosen)' if boldness == chosen else ''}", scores, expert))
+    published = published_table("table_2_3.csv")
+    goal = float(published["human"]["avg"]) / float(published["DDPG"]["avg"])
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_csv(args.out / "players.csv", rows)
+    lines = [f"| {' | '.join(rows[0])} |", "|" + "---|" * len(rows[0])]
+    lines += [f"| {' | '.join(map(str, line.values()))} |" for line in rows]
+    command = f"python benchmark/torcs_players.py{' --calibrate' if args.calibrate else ''} --seed {args.seed}"
+    text = f"`{command}`, commit {commit()}. Table 2.3: {goal:.3f} of DDPG's.\n\n" + "\n".join(lines) + "\n"
+    (args.out / "players.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
