@@ -987,9 +987,9 @@ class Experts(NamedTuple):
 # ---------------------------------------------------------------------------------------------------------------------
 # Playing
 # ---------------------------------------------------------------------------------------------------------------------
-EVALUATION_STREAM, DEMONSTRATION_STREAM = 1_000_000, 1_000_001
+EVALUATION_STREAM = 1_000_000
 HUMAN_STREAM = 1_000_002
-STUDENT_STREAM = 1_000_003  # other episodes than the experts' demonstrations
+STUDENT_STREAM = 1_000_003  # of its demonstrations: other episodes than the experts', 1_000_001
 
 
 def bounded(x: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> np.ndarray:

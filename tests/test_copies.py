@@ -47,6 +47,7 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("mlp", GAIL): "Baselines' initialisation",
     ("read_demonstrations", GAIL): "two experts, and the track",
     ("read_episode", GAIL): "continuous actions, two experts",
+    ("EVALUATION_STREAM", GAIL): "its demonstrations are other episodes than the expert's",
     ("save_demonstrations", GAIL): "the student's policy, sampled or greedy, and the track",
 }
 OWN = {  # each method's own by design

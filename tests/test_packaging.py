@@ -1,6 +1,9 @@
 """Each file runs alone with its own dependencies, and all lists of versions agree."""
 
+import ast
+import importlib
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -59,3 +62,19 @@ def test_package_is_importable_from_anywhere(tmp_path):
     code = "import gymnasium; print(gymnasium.make('cleanrl_thesis.ppo_continuous_kle:kle/Thrower-v2').spec.id)"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert done.stdout == "kle/Thrower-v2\n", done.stderr
+
+
+def example_commands() -> list[str]:
+    """`NAME.py FLAGS` of every command that the README or a method's docstring shows."""
+    texts = [(ROOT / "README.md").read_text(), *(ast.get_docstring(ast.parse(path.read_text())) for path in METHODS)]
+    lines = [line.split("#")[0].strip() for text in texts for line in text.splitlines()]
+    found = [re.fullmatch(r"(?:uv run|python) cleanrl_thesis/(\w+\.py.*)", line) for line in lines]
+    return sorted({match[1] for match in found if match})
+
+
+@pytest.mark.parametrize("command", example_commands())
+def test_every_command_that_is_shown_is_understood(command):
+    script, *flags = shlex.split(command)
+    method = importlib.import_module(f"cleanrl_thesis.{script.removesuffix('.py')}")
+    if "--help" not in flags:
+        method.parse_args(flags)
