@@ -115,7 +115,7 @@ def table_2_3(rows: list[dict]) -> str:
                 means = [with_interval([row[key] for row in found], 1) for key in ("mean", "std")]
                 ended = sum(row["crashes"] + row["standstills"] for row in found)
                 share = ended / sum(row["episodes"] for row in found)
-                ratio = f"{np.mean([row['mean'] for row in found]) / expert:.2f}"
+                ratio = f"{np.mean([row['mean'] for row in found]) / expert:.2f}" if expert else ""
                 laps = f"{np.mean([row['mean_laps'] for row in found]):.2f}"
                 cells = (name, mode, len(found), *extremes, *means, ratio, f"{100 * share:.0f}%", laps)
                 lines.append(f"| {' | '.join(map(str, cells))} |")
@@ -142,28 +142,29 @@ def alpha_table(rows: list[dict]) -> str:
 
 
 def figure_2_8(rows: list[dict]) -> Figure:
-    """Score over α as a share of the DDPG expert's, with the published ones."""
+    """Score over α, with the published ones scaled as their DDPG is to ours."""
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axes = figure.subplots()
     expert, _ = interval([row["mean"] for row in select(rows, "expert", "demonstrations")])
     human, _ = interval([row["mean"] for row in select(rows, "human", "demonstrations")])
     for mode, colour in zip(MODES, ("tab:blue", "tab:orange")):
         curve = alpha_curve(rows, mode)
-        means, halves = np.array([interval(scores) for scores in curve.values()]).T / expert
+        means, halves = np.array([interval(scores) for scores in curve.values()]).T
         axes.plot(list(curve), means, "o-", color=colour, markersize=4, label=f"hybrid, {mode}")
         low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
         axes.fill_between(list(curve), low, high, color=colour, alpha=0.15, linewidth=0)
         mixed = {row["alpha"]: row for row in rows if row["kind"].startswith("mix_alpha") and row["mode"] == mode}
         points = {alpha: [r["mean"] for r in select(rows, row["kind"], mode)] for alpha, row in sorted(mixed.items())}
         if points:
-            heights = [np.mean(scores) / expert for scores in points.values()]
+            heights = [np.mean(scores) for scores in points.values()]
             axes.plot(list(points), heights, "x", color=colour, label=f"actions mixed by cloning, {mode}")
-    axes.axhline(1, color="black", linestyle="--", linewidth=1, label=f"DDPG, {expert:.0f}")
-    axes.axhline(human / expert, color="black", linestyle=":", linewidth=1, label=f"synthetic human, {human:.0f}")
+    axes.axhline(expert, color="black", linestyle="--", linewidth=1, label=f"DDPG, {expert:.0f}")
+    axes.axhline(human, color="black", linestyle=":", linewidth=1, label=f"synthetic human, {human:.0f}")
     published = {name: float(row["avg"]) for name, row in published_table("table_2_3.csv").items()}
-    stars = {0.0: published["GAIL, α = 0"] / published["DDPG"], 0.5: published["hybrid, α = 0.5"] / published["DDPG"]}
-    axes.plot(list(stars), list(stars.values()), "k*", markersize=9, label="published, of its DDPG (819)")
-    axes.set(xlabel="α, weight of the DDPG expert", ylabel="score, as a share of the DDPG expert's", ylim=(0, None))
+    scale = expert / published["DDPG"]
+    stars = {0.0: published["GAIL, α = 0"] * scale, 0.5: published["hybrid, α = 0.5"] * scale}
+    axes.plot(list(stars), list(stars.values()), "k*", markersize=9, label=f"published (times {scale:.2f})")
+    axes.set(xlabel="α, weight of the DDPG expert", ylabel="score, (km/h) s", ylim=(0, None))
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1, 0.5))
     seeds = sorted({len(scores) for scores in alpha_curve(rows, "sampled").values()})

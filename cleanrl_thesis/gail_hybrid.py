@@ -448,7 +448,7 @@ NEAR = 20.0  # m, within which other cars are seen by points of their outline, a
 def turned(xy: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Points (2, ...) turned to the left by angles (...)."""
     (x, y), cosine, sine = xy, np.cos(angle), np.sin(angle)
-    return np.stack([cosine * x - sine * y, sine * x + cosine * y])
+    return np.array([cosine * x - sine * y, sine * x + cosine * y])
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
@@ -538,14 +538,14 @@ class Cars:
         dt = 1 / (FPS * SUBSTEPS)
         ahead, left = self.velocity
         left_front, left_rear = left + FRONT_AXLE * self.yaw_rate, left - REAR_AXLE * self.yaw_rate
-        rolling = np.stack(
+        rolling = np.array(
             [ahead * cosine + left_front * sine, ahead]
         )  # speeds in the wheels' directions, front and rear
-        lateral = np.stack([left_front * cosine - ahead * sine, left_rear])
+        lateral = np.array([left_front * cosine - ahead * sine, left_rear])
         reference = np.maximum(np.abs(rolling), SLIP_FLOOR)
 
         shift = self.push * HEIGHT
-        load = MASS * np.stack([9.81 * REAR_AXLE - shift, 9.81 * FRONT_AXLE + shift]) / (FRONT_AXLE + REAR_AXLE)
+        load = MASS * np.array([9.81 * REAR_AXLE - shift, 9.81 * FRONT_AXLE + shift]) / (FRONT_AXLE + REAR_AXLE)
         sliding = self.spin * WHEEL_RADIUS - rolling
         slip = np.sqrt(sliding * sliding + lateral * lateral) / reference + 1e-9
         per_speed = tyre_force(slip, load) / (slip * reference)  # N / (m/s)
@@ -553,8 +553,8 @@ class Cars:
         ratio, rpm = GEARS[self.gear], self.rpm()
         runs = (self.shifting == 0) & (rpm < LIMIT_RPM)
         torque = throttle * np.minimum(TORQUE[0] + rpm * TORQUE_SLOPE, TORQUE[1]) * ratio * runs
-        inertia = np.stack([np.full_like(ratio, WHEEL_INERTIA), WHEEL_INERTIA + ENGINE_INERTIA * ratio**2])
-        torque = np.stack([np.zeros_like(torque), torque])
+        inertia = np.array([np.full_like(ratio, WHEEL_INERTIA), WHEEL_INERTIA + ENGINE_INERTIA * ratio**2])
+        torque = np.array([np.zeros_like(torque), torque])
         resistance = inertia + dt * WHEEL_RADIUS**2 * per_speed
         spin = (inertia * self.spin + dt * (torque + WHEEL_RADIUS * per_speed * rolling)) / resistance
         most = dt * BRAKE[:, None] * brake / resistance
@@ -570,7 +570,7 @@ class Cars:
         )
         self.push = (ahead_front + ahead_rear - DRAG * ahead * np.abs(ahead)) / MASS
         yaw_push = (FRONT_AXLE * left_front - REAR_AXLE * left_rear) / YAW_INERTIA
-        pushes = np.stack([self.push + left * self.yaw_rate, (left_front + left_rear) / MASS - ahead * self.yaw_rate])
+        pushes = np.array([self.push + left * self.yaw_rate, (left_front + left_rear) / MASS - ahead * self.yaw_rate])
         self.velocity = self.velocity + dt * pushes
         self.yaw_rate = self.yaw_rate + dt * yaw_push
         self.xy = self.xy + dt * turned(self.velocity, self.yaw + dt / 2 * self.yaw_rate)
