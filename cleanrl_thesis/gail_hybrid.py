@@ -3,7 +3,7 @@
     python cleanrl_thesis/gail_hybrid.py --demos-rl runs/expert/demos                 # the hybrid, α = 0.5
     python cleanrl_thesis/gail_hybrid.py --alpha 0                                    # GAIL on the human
     python cleanrl_thesis/gail_hybrid.py --alpha 1 --demos-rl runs/expert/demos       # GAIL on the DDPG expert
-    python cleanrl_thesis/gail_hybrid.py --env-id Hopper-v4 --alpha 1 --demos-rl runs/hopper/demos --num-envs 1
+    python cleanrl_thesis/gail_hybrid.py --env-id Hopper-v5 --alpha 1 --demos-rl runs/hopper/demos
 
 The student π and the discriminator D play L_mix(π) = E_π[log D] + α E_RL[log(1 − D)] + (1 − α) E_HE[log(1 − D)]
 (Eq. 2.3.1): D makes it large, so D → 1 means *student*; π makes it small, by TRPO with the reward −log D. The reward of
