@@ -826,15 +826,16 @@ class SyntheticDriver:
     slows down before curves and parked cars once they are in sight. Its numbers are guesses: it is not yet calibrated to Table 2.3.
     """
 
-    look, look_spread = 9.0, 0.3  # median time between looks in steps of 0.02 s, and its deviation as a share
-    reaction = 10  # steps from a look to the hands
+    look, look_spread = 7.0, 0.3  # median time between looks in steps of 0.02 s, and its deviation as a share
+    reaction = 8  # steps from a look to the hands
     sight = 120.0  # m of road that it heeds
     comfort = 7.0  # m/s² to the side in curves
     braking = 4.5  # m/s² with which it expects to slow down
     fastest = 46.0  # m/s on a straight
     passing = 0.82  # share of that beside parked cars
     room = 3.6  # m between the middles of two cars when it passes
-    preview = 1.2  # s, to the point that it steers for
+    preview = 1.2  # s, to the point that it steers for; in curves less, but at least 1 s
+    cutting = 2.0  # m by which the straight line to that point may cut a curve
     steering_error, hand_error = 0.15, 0.012  # of each correction, as a share; and of the wheel, as a share of its lock
     boldness, boldness_spread = (
         1.0,
@@ -848,6 +849,7 @@ class SyntheticDriver:
         self.hands = np.zeros((self.reaction + 1, 2, num_cars))  # steering and pedal of the last steps
         self.decided = np.zeros((2, num_cars))
         self.boldness = self.boldness * np.exp(self.boldness_spread * self.rng.standard_normal(num_cars))
+        self.heeded, self.side = np.full(num_cars, -1), np.ones(num_cars)  # which parked car, and where it passes it
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """Actions (N, 2) for the next step; it sees the road itself and not the observations."""
@@ -861,24 +863,35 @@ class SyntheticDriver:
         return self.hands[self.step % len(self.hands)].T.astype(np.float32)  # the oldest
 
     def parked_ahead(self, cars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Way in m to the next parked car that each driver heeds, inf for none, and how far left of the road it is."""
+        """Way in m to the next parked car that each driver heeds, inf for none; and its number, -1 for none."""
         track, speed = self.cars.track, self.cars.velocity[0, cars]
         place = track.distances[self.cars.segment[cars]] + self.cars.along[cars]
         gaps = (np.array(PARKED) - place[:, None] + 8) % track.length - 8  # heeded until 8 m behind
         nearest = gaps.argmin(1)
         gap = gaps[np.arange(len(cars)), nearest]
-        left = np.array(PARKED_LEFT)[nearest] * track.half_width
-        return np.where(gap < np.maximum(60, 2.5 * speed), gap, np.inf), left
+        heeds = gap < np.maximum(60, 2.5 * speed)
+        return np.where(heeds, gap, np.inf), np.where(heeds, nearest, -1)
+
+    def choose_sides(self, cars: np.ndarray, number: np.ndarray) -> np.ndarray:
+        """Where the drivers go to pass a parked car, (n,) m left of the middle of the road; chosen once for each."""
+        parked = np.array(PARKED_LEFT)[number] * self.cars.track.half_width
+        nearer = np.where(self.cars.left[cars] > parked, 1, -1)
+        side = np.where(np.abs(parked) < 0.5, nearer, -np.sign(parked))
+        self.side[cars] = np.where(number == self.heeded[cars], self.side[cars], side)
+        self.heeded[cars] = number
+        return parked + self.side[cars] * self.room
 
     def steering(self, cars: np.ndarray) -> np.ndarray:
         """Where the given drivers turn the wheel to, (n,) in [-1, 1]: towards a point ahead on the road."""
         track, state = self.cars.track, self.cars
-        gap, parked = self.parked_ahead(cars)
-        side = np.where(np.abs(parked) < 0.5, np.where(state.left[cars] > parked, 1, -1), -np.sign(parked))
-        target = np.where(np.isfinite(gap), parked + side * self.room, 0)
+        speed = state.velocity[0, cars]
+        _, number = self.parked_ahead(cars)
+        target = np.where(number < 0, 0, self.choose_sides(cars, number))
         target = np.clip(target, CAR_WIDTH - track.half_width, track.half_width - CAR_WIDTH)
-        place = track.distances[state.segment[cars]] + state.along[cars]
-        _, point, _ = track.place(place + np.maximum(self.preview * state.velocity[0, cars], 8), target)
+        place, way = track.distances[state.segment[cars]] + state.along[cars], np.maximum(self.preview * speed, 8)
+        segment, _, _ = track.place(place + way, target)
+        chord = np.sqrt(8 * self.cutting / np.maximum(np.abs(track.curvatures[segment]), 1e-4))
+        _, point, _ = track.place(place + np.clip(way, speed, np.maximum(speed, chord)), target)
 
         delay = (self.reaction + self.look / 2) / FPS
         turn = state.yaw_rate[cars] * delay
