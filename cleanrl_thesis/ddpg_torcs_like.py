@@ -13,6 +13,7 @@ after every crash: on the same machine the run ends with the same bytes.
 | steps, replay buffer | 10,000,000; 1,000,000 | section 2.4.3 |
 | learning rate of actor and critic | 1e-4, 1e-3 | OpenAI Baselines' defaults; section 2.4.3 names them the other way round |
 | both annealed to 0 | on | ours; Baselines' are constant |
+| policy that is kept | the best of evaluations every 200,000 steps, in episodes of their own | ours; Baselines' is the last |
 | γ, τ, batch, L2 of the critic, layer norm | 0.99, 0.01, 64, 1e-2, on | OpenAI Baselines' defaults |
 | observations | normalised by running statistics, clipped to 5 deviations of at least 0.1 | OpenAI Baselines' defaults |
 | updates | 50 after every 100 steps | OpenAI Baselines' defaults; with held actions that is 5 times as many for each action |
@@ -138,6 +139,8 @@ class Args:
     """Adam's learning rate for the critic (Baselines)"""
     anneal_lr: bool = True
     """anneal both learning rates linearly to 0; off: constant (Baselines)"""
+    keep_best_every: int = 200_000
+    """steps between evaluations without noise, whose best policy is kept at the end; 0: the last policy (Baselines)"""
     critic_l2: float = 1e-2
     """weight of half the squared weights of the critic's two hidden layers in its loss (Baselines has three)"""
     hidden_size: int = 64
@@ -222,7 +225,7 @@ def complete_args(args: Args) -> Args:
         ("critic_l2 noise_std", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
         ("gamma tau", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
-        ("save_demos train_steps", lambda x: x >= 0, "must be at least 0"),
+        ("save_demos train_steps keep_best_every", lambda x: x >= 0, "must be at least 0"),
     ):
         for name in names.split():
             require(holds(getattr(args, name)), f"--{name.replace('_', '-')}", getattr(args, name), allowed)
@@ -870,6 +873,7 @@ def numpy_actions(parameters: dict[str, np.ndarray], obs: np.ndarray) -> np.ndar
 # Playing, and the replay buffer
 # ---------------------------------------------------------------------------------------------------------------------
 EVALUATION_STREAM, DEMONSTRATION_STREAM = 1_000_000, 1_000_001
+SELECTION_STREAM, SELECTION_EPISODES = 1_000_004, 20
 
 
 @functools.lru_cache
@@ -1054,7 +1058,11 @@ class RunningNorm:
         self.sums += obs.sum(0), np.einsum("no,no->o", obs, obs, dtype=np.float64)
         mean, square = self.sums / self.count
         deviation = np.sqrt(np.maximum(square - mean * mean, self.least**2))
-        self.scale.copy_(torch.from_numpy(np.stack([mean, deviation])))
+        self.set_scale(torch.from_numpy(np.stack([mean, deviation])))
+
+    def set_scale(self, scale: torch.Tensor) -> None:
+        """Normalise by another mean and deviation, (2, O)."""
+        self.scale.copy_(scale)
         self.mean, self.deviation = self.scale.cpu().numpy()
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
@@ -1066,8 +1074,7 @@ class RunningNorm:
 
     def load_state_dict(self, state: dict) -> None:
         self.count, self.sums = state["count"], state["sums"].numpy().copy()
-        self.scale.copy_(state["scale"])
-        self.mean, self.deviation = self.scale.cpu().numpy()
+        self.set_scale(state["scale"])
 
 
 class ReplayBuffer:
@@ -1187,6 +1194,41 @@ class ActionNoise:
 
     def load_state_dict(self, state: dict) -> None:
         self.noise = state["noise"].numpy().copy()
+
+
+class Best:
+    """The policy with the best mean return in the evaluations for `--keep-best-every`, if there were any."""
+
+    def __init__(self, optimizer: "FlatAdam", norm: RunningNorm):
+        self.optimizer, self.norm = optimizer, norm
+        self.actor, self.scale = optimizer.vector[: optimizer.actor_size].clone(), norm.scale.clone()
+        self.step, self.score, self.last_score = 0, -math.inf, math.nan
+
+    def consider(self, args: Args, space: gym.spaces.Box, step: int) -> None:
+        """Evaluate the present policy, and keep it where none was better."""
+        seeds = [episode_seed(args.seed, SELECTION_STREAM, i) for i in range(SELECTION_EPISODES)]
+        policy = held(make_policy(self.optimizer, self.norm, space), args.frame_skip)
+        episodes = play(policy, make_games(args, len(seeds)), seeds)
+        self.last_score = float(np.mean([episode["rewards"].sum() for episode in episodes]))
+        if self.last_score >= self.score:
+            self.step, self.score = step, self.last_score
+            self.actor.copy_(self.optimizer.vector[: self.optimizer.actor_size])
+            self.scale.copy_(self.norm.scale)
+
+    def restore(self) -> None:
+        """Make it the agent's; the last one stays where there was no evaluation."""
+        if self.step:
+            self.optimizer.vector[: self.optimizer.actor_size] = self.actor
+            self.norm.set_scale(self.scale)
+
+    def state_dict(self) -> dict:
+        names = ("actor", "scale", "step", "score", "last_score")
+        return {name: getattr(self, name) for name in names}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.actor.copy_(state["actor"])
+        self.scale.copy_(state["scale"])
+        self.step, self.score, self.last_score = state["step"], state["score"], state["last_score"]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -1794,6 +1836,7 @@ def main(args: Args) -> int:
     agent = Agent(obs_dim, action_dim, args.hidden_size, args.layer_norm).to(device)
     optimizer = FlatAdam(agent, args)
     norm = RunningNorm(agent.obs_scale, args.normalize_obs)
+    best = Best(optimizer, norm)
     players = make_players(args)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
     explorer = (ParameterNoise if args.noise == "parameter" else ActionNoise)(optimizer, args, action_dim, rng)
@@ -1815,6 +1858,7 @@ def main(args: Args) -> int:
         training_seconds, offsets = checkpoint["training_seconds"], checkpoint["offsets"]
         optimizer.load_state_dict(checkpoint["optimizer"])
         norm.load_state_dict(checkpoint["norm"])
+        best.load_state_dict(checkpoint["best"])
         explorer.load_state_dict(checkpoint["explorer"])
         rng.bit_generator.state = json.loads(checkpoint["rng"])
         vars(means).update(checkpoint["means"])
@@ -1863,6 +1907,8 @@ def main(args: Args) -> int:
                 distance = explorer.adapt(norm(buffer.sample(args.batch_size, rng).numpy()[:, :obs_dim]))
             means.add(update(buffer.sample(args.batch_size, rng).to(device)))
             updates += 1
+        if args.keep_best_every and global_step // args.keep_best_every > before // args.keep_best_every:
+            best.consider(args, env.action_space, global_step)
 
         logs = global_step // LOG_INTERVAL > before // LOG_INTERVAL or iteration == args.num_iterations
         crossed = global_step // args.checkpoint_interval > before // args.checkpoint_interval
@@ -1875,6 +1921,7 @@ def main(args: Args) -> int:
             raise RunError(f"step {global_step}: the networks' parameters are no longer finite")
         if logs:
             metrics = {**means.take(), "charts/noise_size": explorer.size, "charts/noise_distance": distance}
+            metrics["charts/selection_return"] = best.last_score
             updates_csv.write({"global_step": global_step, **metrics})
             add_scalars(writer, {**metrics, "charts/SPS": global_step / training_seconds}, global_step)
         if crossed or stop.received or iteration == last_iteration:
@@ -1888,6 +1935,7 @@ def main(args: Args) -> int:
                 "offsets": {"episodes": episodes_csv.sync(), "updates": updates_csv.sync()},
                 "optimizer": optimizer.state_dict(),
                 "norm": norm.state_dict(),
+                "best": best.state_dict(),
                 "explorer": explorer.state_dict(),
                 "added": buffer.sync(),
                 "rng": json.dumps(rng.bit_generator.state),
@@ -1904,15 +1952,17 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    finish_run(
-        agent, make_policy(optimizer, norm, env.action_space), args, run_dir, global_step, training_seconds, writer
-    )
+    best.restore()
+    policy = make_policy(optimizer, norm, env.action_space)
+    finish_run(agent, policy, best.step, args, run_dir, global_step, training_seconds, writer)
     writer.close()
     return 0
 
 
-def finish_run(agent: Agent, policy, args: Args, run_dir: Path, global_step: int, seconds: float, writer) -> None:
-    """Evaluate, draw, save what was asked for, and write `result.json` last."""
+def finish_run(
+    agent: Agent, policy, kept_step: int, args: Args, run_dir: Path, global_step: int, seconds: float, writer
+) -> None:
+    """Evaluate, draw, save what was asked for, and write `result.json` last; the policy is that of `kept_step`, if not 0."""
     evaluation = evaluate(policy, args, run_dir)
     for name in ("mean", "std", "min", "max"):
         writer.add_scalar(f"eval/episodic_return_{name}", evaluation[name], global_step)
@@ -1927,6 +1977,7 @@ def finish_run(agent: Agent, policy, args: Args, run_dir: Path, global_step: int
         "env_id": args.env_id,
         "seed": args.seed,
         "global_step": global_step,
+        "kept_step": kept_step or global_step,
         "complete": global_step == args.num_iterations * args.rollout_steps,
         "finish": {name: arguments(args)[name] for name in FINISH},
         "training": {"mode": "with noise", **summary(read_episodes(run_dir)[-50:, 1])},

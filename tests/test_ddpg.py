@@ -306,3 +306,26 @@ def test_an_action_is_held_until_its_end_or_the_episode_s():
 def test_a_held_policy_acts_anew_every_few_steps():
     act = ddpg.held(lambda obs: obs.copy(), 3)
     assert [act(np.array([t])).item() for t in range(7)] == [0, 0, 0, 3, 3, 3, 6]
+
+
+def test_the_best_policy_is_kept(monkeypatch):
+    """Of evaluations with returns 1, 3, 2: the second; restored with the normalisation that it had."""
+    args, _, optimizer, update, _ = make()
+    best, space = ddpg.Best(optimizer, update.norm), gym.spaces.Box(-1, 1, (ACTIONS,))
+    returns, vectors, scales = iter([1.0, 3.0, 2.0]), [], []
+    monkeypatch.setattr(ddpg, "make_games", lambda args, number: None)
+    monkeypatch.setattr(ddpg, "play", lambda *_: [{"rewards": np.array([next(returns)])}])
+    for step in (10, 20, 30):
+        vectors.append(optimizer.vector.clone())
+        scales.append(update.norm.scale.clone())
+        best.consider(args, space, step)
+        optimizer.vector.add_(1.0)
+        update.norm.update(np.ones((50, OBS), np.float32))
+    again = ddpg.Best(optimizer, update.norm)
+    again.load_state_dict(best.state_dict())
+    again.restore()
+    size = optimizer.actor_size
+    assert torch.equal(optimizer.vector[:size], vectors[1][:size]) and torch.equal(update.norm.scale, scales[1])
+    assert not torch.equal(optimizer.vector[size:], vectors[1][size:]) and (again.step, again.score) == (20, 3.0)
+    obs = np.ones((2, OBS), np.float32)
+    assert np.allclose(update.norm(obs), (obs - scales[1][0].numpy()) / scales[1][1].numpy())

@@ -21,6 +21,7 @@ DDPG, GAIL = ROOT / "cleanrl_thesis" / "ddpg_torcs_like.py", ROOT / "cleanrl_the
 SMALL_DDPG = [
     *("--total-timesteps", 8_000, "--num-envs", 5, "--buffer-size", 3_000, "--batch-size", 16, "--train-steps", 20),
     *("--hidden-size", 16, "--perturb-interval", 100, "--checkpoint-interval", 1_000, "--eval-episodes", 2),
+    *("--keep-best-every", 2_000),
 ]
 SMALL_GAIL = [
     *("--total-timesteps", 5_120, "--num-envs", 4, "--num-steps", 64, "--human-episodes", 2, "--hidden-size", 16),
