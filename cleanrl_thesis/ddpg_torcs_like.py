@@ -1323,6 +1323,19 @@ def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float,
     vector.sub_(rates * (mean / (1 - 0.9**step)) / denominator)
 
 
+def compiled_gradient(loss, vector: torch.Tensor, *inputs) -> tuple[torch.Tensor, tuple]:
+    """Gradient of `loss(vector, *inputs)[0]`, (P,), and the second of what it returns."""
+    return torch.func.grad(loss, has_aux=True)(vector, *inputs)
+
+
+def plain_gradient(loss, vector: torch.Tensor, *inputs) -> tuple[torch.Tensor, tuple]:
+    """The same by autograd, which cannot be compiled, but takes less time where nothing is."""
+    vector = vector.detach().requires_grad_()
+    with torch.enable_grad():
+        value, parts = loss(vector, *inputs)
+    return torch.autograd.grad(value, vector)[0], parts
+
+
 class Update:
     """One step of Adam on one minibatch, for actor and critic at once, and one of the target networks."""
 
@@ -1376,7 +1389,8 @@ class Update:
     def plain_step(self, vector, target, mean, square, step, scale, rows) -> tuple[torch.Tensor, ...]:
         minibatch = Minibatch.unpack(rows, scale, self.norm.limit)
         targets = self.target_values(target, minibatch)
-        gradient, parts = torch.func.grad(self.loss, has_aux=True)(vector, minibatch, targets)
+        differentiate = compiled_gradient if torch.compiler.is_compiling() else plain_gradient
+        gradient, parts = differentiate(self.loss, vector, minibatch, targets)
         adam_step(vector, mean, square, step, self.optimizer.rates, gradient, math.inf, 1e-8)
         target.lerp_(vector, self.args.tau)
         return parts
