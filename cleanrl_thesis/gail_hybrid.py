@@ -19,9 +19,9 @@ agent, and not yet calibrated to Table 2.3, where it is to the expert as 637 to 
 | steps | 5,000,000 for GAIL (α = 0), else 7,500,000 | section 2.4.3 |
 | KL bound, discriminator's learning rate | 0.01, 1e-3 | section 2.4.3 |
 | networks | two layers of 100 with tanh, for policy, values and discriminator | the study's code |
-| batch | 1,024 steps for GAIL, else 512; 3 policy updates for one of the discriminator | the study's code |
+| updates of the policy for one of the discriminator | 3 | the study's code |
+| batch | 128 steps in each of 16 environments | ours; the study's code has 1,024 steps in one for GAIL, 512 for the hybrid |
 | Fisher matrix | from a fifth of a batch | OpenAI Baselines' |
-| environments side by side | 16, each for a share of the batch | ours; the study's code has one |
 | actions that the discriminator sees | within the bounds | ours; the study's code shows them as sampled |
 | CG iterations, damping; γ, λ; passes over the value function, rate; entropies | 10, 0.1; 0.995, 0.97; 5, 1e-3; 0, 1e-3 | the study's code |
 | which label is the expert's | D → 0 | Eq. 2.3.1; the prose and the study's code have D and 1 − D swapped |
@@ -139,8 +139,8 @@ class Args:
     """environment steps; default: 5,000,000 for α = 0, else 7,500,000 (section 2.4.3)"""
     num_envs: int = 16
     """environments side by side"""
-    num_steps: int | None = None
-    """steps of each environment per update; default: 1,024 / num_envs for α = 0, else 512 / num_envs"""
+    num_steps: int = 128
+    """steps of each environment per update"""
     g_steps: int = 3
     """updates of the policy for each round of the discriminator"""
     d_steps: int = 1
@@ -220,9 +220,8 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
-    is_gail = args.alpha == 0
     if args.total_timesteps is None:
-        args.total_timesteps = 5_000_000 if is_gail else 7_500_000
+        args.total_timesteps = 5_000_000 if args.alpha == 0 else 7_500_000
     args.stop_at = max(1, args.total_timesteps) if args.stop_at is None else args.stop_at
     counts = "num_threads num_envs eval_episodes checkpoint_interval stop_at human_episodes hidden_size"
     for names, holds, allowed in (
@@ -241,8 +240,6 @@ def complete_args(args: Args) -> Args:
     ):
         for name in names.split():
             require(holds(getattr(args, name)), f"--{name.replace('_', '-')}", getattr(args, name), allowed)
-    if args.num_steps is None:
-        args.num_steps = max(1, (1_024 if is_gail else 512) // args.num_envs)
     require(args.num_steps >= 2, "--num-steps", args.num_steps, "must be at least 2")
     require(not args.resume or args.run_dir is not None, "--resume", "", "needs --run-dir, the folder to go on in")
     require(args.track_name in TRACKS, "--track-name", args.track_name, f"must be one of {', '.join(TRACKS)}")

@@ -243,7 +243,7 @@ BAD_GAIL = [
     (["--alpha", 0, "--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "--demos-human"]),
     (["--alpha", 0, "--max-kl", 0], ["--max-kl", "0.0"]),
     (["--alpha", 0, "--num-steps", 1], ["--num-steps", "1"]),
-    (["--alpha", 0, "--total-timesteps", 100], ["--total-timesteps", "100", "1024"]),
+    (["--alpha", 0, "--total-timesteps", 100], ["--total-timesteps", "100", "2048"]),
     (["--alpha", 0, "--total-timesteps", 0], ["--total-timesteps", "0", "--bc-epochs"]),
     (["--alpha", 0, "--reward-form", "odd"], ["--reward-form", "odd"]),
     (["--alpha", 1, "--demos-rl", "no/such/folder"], ["--demos-rl", "no/such/folder", "manifest"]),
