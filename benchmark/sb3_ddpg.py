@@ -3,13 +3,12 @@
 python benchmark/sb3_ddpg.py 10000     # steps
 """
 
-import json
 import sys
-import time
 
 import gymnasium as gym
 import numpy as np
 import torch
+from sb3_timing import report, timed
 from stable_baselines3 import DDPG
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
@@ -23,10 +22,7 @@ def main(steps: int) -> None:
     settings |= {"train_freq": 100, "gradient_steps": 50, "gamma": 0.99, "seed": 1, "device": "cpu"}
     noise = NormalActionNoise(np.zeros(2), 0.2 * np.ones(2))
     model = DDPG("MlpPolicy", env, action_noise=noise, policy_kwargs={"net_arch": [64, 64]}, **settings)
-    model.learn(1_000)  # warm-up
-    start = time.perf_counter()
-    model.learn(steps, reset_num_timesteps=False)
-    print(json.dumps({"steps_per_second": steps / (time.perf_counter() - start)}))
+    report(timed(model, 1_000, steps))
 
 
 if __name__ == "__main__":

@@ -3,12 +3,11 @@
 python benchmark/sb3_dqn.py 50000     # frames
 """
 
-import json
 import sys
-import time
 
 import gymnasium as gym
 import torch
+from sb3_timing import report, timed
 from stable_baselines3 import DQN
 from stable_baselines3.common.monitor import Monitor
 
@@ -20,10 +19,7 @@ def main(frames: int) -> None:
     settings = {"learning_rate": 5e-4, "buffer_size": 200_000, "batch_size": 32, "learning_starts": 1_000}
     settings |= {"train_freq": 4, "gradient_steps": 1, "target_update_interval": 500, "seed": 1, "device": "cpu"}
     model = DQN("MlpPolicy", env, exploration_final_eps=0.1, policy_kwargs={"net_arch": [64, 64]}, **settings)
-    model.learn(2_000)  # warm-up
-    start = time.perf_counter()
-    model.learn(frames, reset_num_timesteps=False)
-    print(json.dumps({"steps_per_second": frames / (time.perf_counter() - start)}))
+    report(timed(model, 2_000, frames))
 
 
 if __name__ == "__main__":

@@ -3,12 +3,11 @@
 python benchmark/sb3_ppo.py kle/HalfCheetah-v2 10 8     # task, K, iterations of 2,048 steps
 """
 
-import json
 import sys
-import time
 
 import gymnasium as gym
 import torch
+from sb3_timing import report, timed
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -21,10 +20,7 @@ def main(env_id: str, update_epochs: int, iterations: int) -> None:
     envs = VecNormalize(DummyVecEnv([lambda: Monitor(gym.make(gym_id, disable_env_checker=True))]))
     settings = {"n_steps": 2048, "batch_size": 64, "clip_range_vf": 0.2, "device": "cpu", "seed": 1}
     model = PPO("MlpPolicy", envs, n_epochs=update_epochs, **settings)
-    model.learn(2048)  # warm-up
-    start = time.perf_counter()
-    model.learn(iterations * 2048, reset_num_timesteps=False)
-    print(json.dumps({"steps_per_second": iterations * 2048 / (time.perf_counter() - start)}))
+    report(timed(model, 2048, iterations * 2048))
 
 
 if __name__ == "__main__":

@@ -3,13 +3,12 @@
 python benchmark/sb3_trpo.py Hopper-v5 10     # environment, batches of 2,048 steps, seed
 """
 
-import json
 import sys
-import time
 
 import gymnasium as gym
 import torch
 from sb3_contrib import TRPO
+from sb3_timing import report, timed
 from stable_baselines3.common.monitor import Monitor
 
 
@@ -22,12 +21,8 @@ def main(env_id: str, batches: int, seed: int = 1) -> None:
     settings |= {"cg_damping": 0.1 / dimensions, "target_kl": 0.01 / dimensions, "cg_max_steps": 10}
     settings |= {"seed": seed, "device": "cpu"}
     model = TRPO("MlpPolicy", env, policy_kwargs={"net_arch": [100, 100]}, **settings)
-    model.learn(2_048)  # warm-up
-    start = time.perf_counter()
-    model.learn(batches * 2_048, reset_num_timesteps=False)
-    speed = batches * 2_048 / (time.perf_counter() - start)
-    returns = env.get_episode_rewards()[-50:]
-    print(json.dumps({"steps_per_second": speed, "last_50_returns": returns}))
+    speed = timed(model, 2_048, batches * 2_048)
+    report(speed, last_50_returns=env.get_episode_rewards()[-50:])
 
 
 if __name__ == "__main__":

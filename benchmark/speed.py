@@ -3,8 +3,8 @@
     python benchmark/speed.py ppo                                  # about 15 minutes; needs the group `bench`
     python benchmark/speed.py ppo --update-epochs 10 --rounds 1    # a first look
     python benchmark/speed.py apple                                # the game alone, and DQN on it; about 3 minutes
-    python benchmark/speed.py torcs                                # the simulator alone, and DDPG on it; about 8 minutes
-    python benchmark/speed.py gail                                 # GAIL beside TRPO without it; about 5 minutes
+    python benchmark/speed.py torcs                                # the simulator alone, and DDPG on it; about 12 minutes
+    python benchmark/speed.py gail                                 # GAIL beside TRPO without it; about 3 minutes
 
 Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,torcs,gail}.json` and `.md`: the median of each contender and of its ratios to
 the peer, round by round, with their range. The ratios are the result: the machine's own speed drifts.

@@ -1,6 +1,6 @@
 """TRPO alone, paid by the environment: the returns of gail_hybrid.py's and of sb3-contrib's, seed by seed.
 
-    python benchmark/trpo_returns.py                          # Hopper-v5, 300,000 steps, 5 seeds each: about an hour
+    python benchmark/trpo_returns.py                          # Hopper-v5, 300,000 steps, 5 seeds each
     python benchmark/trpo_returns.py --seeds 1 --batches 10   # a first look
 
 Writes `benchmark/results/trpo/returns.{json,md}`: the mean return of each seed's last 50 episodes, and the 95% t-interval

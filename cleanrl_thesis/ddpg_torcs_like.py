@@ -140,7 +140,7 @@ class Args:
     anneal_lr: bool = True
     """anneal both learning rates linearly to 0; off: constant (Baselines)"""
     keep_best_every: int = 200_000
-    """steps between evaluations without noise, whose best policy is kept at the end; 0: the last policy (Baselines)"""
+    """steps between evaluations without noise, and one at the end, whose best policy is kept; 0: the last (Baselines)"""
     critic_l2: float = 1e-2
     """weight of half the squared weights of the critic's two hidden layers in its loss (Baselines has three)"""
     hidden_size: int = 64
@@ -1921,10 +1921,11 @@ def main(args: Args) -> int:
                 distance = explorer.adapt(norm(buffer.sample(args.batch_size, rng).numpy()[:, :obs_dim]))
             means.add(update(buffer.sample(args.batch_size, rng).to(device)))
             updates += 1
-        if args.keep_best_every and global_step // args.keep_best_every > before // args.keep_best_every:
+        is_last = iteration == args.num_iterations
+        if args.keep_best_every and (is_last or global_step // args.keep_best_every > before // args.keep_best_every):
             best.consider(args, env.action_space, global_step)
 
-        logs = global_step // LOG_INTERVAL > before // LOG_INTERVAL or iteration == args.num_iterations
+        logs = global_step // LOG_INTERVAL > before // LOG_INTERVAL or is_last
         crossed = global_step // args.checkpoint_interval > before // args.checkpoint_interval
         if not (logs or crossed or stop.received or iteration == last_iteration):
             continue

@@ -280,46 +280,6 @@ def test_the_report_takes_whatever_is_done(teacher, student, tmp_path):
 
 
 # What a user can get wrong
-BAD_DQN = [
-    (["--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "Discrete"]),
-    (["--env-id", "NoSuchGame-v0"], ["NoSuchGame"]),
-    (["--total-timesteps", 3, "--num-envs", 4], ["--total-timesteps", "4 frames"]),
-    (["--batch-size", 64, "--buffer-size", 32], ["--batch-size", "64", "32"]),
-    (["--end-e", "2"], ["--end-e", "2.0", "between 0 and 1"]),
-    (["--gamma", "nan"], ["--gamma", "nan"]),
-    (["--train-frequency", 0], ["--train-frequency", "0"]),
-    (["--n-step", 0], ["--n-step", "0"]),
-    (["--learning-rate", "-1"], ["--learning-rate"]),
-    (["--no-such-flag"], ["--no-such-flag"]),
-    (["--resume"], ["--resume", "--run-dir"]),
-]
-BAD_DISTILL = [
-    (["--alpha", 0.5], ["--alpha", "0.5", "--teacher"]),
-    (["--alpha", 1.5], ["--alpha", "1.5", "between 0 and 1"]),
-    (["--alpha", "nan"], ["--alpha", "nan"]),
-    (["--alpha", 0, "--temperature", -1], ["--temperature", "-1.0"]),
-    (["--alpha", 0, "--dropout", 1], ["--dropout", "1.0", "less than 1"]),
-    (["--alpha", 0, "--test-frames", 16_000], ["--test-frames", "16000"]),
-    (["--alpha", 0, "--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "--demos"]),
-    (["--alpha", 0, "--states", "mine"], ["--states", "mine"]),
-    (["--alpha", 0, "--states", "own"], ["--states", "own", "--teacher"]),
-    (["--alpha", 0, "--split", "episode", "--demo-frames", 1800], ["--split", "episode", "no episode to train on"]),
-    (["--teacher", "no/such/folder"], ["--teacher", "no/such/folder", "model.safetensors"]),
-    (["--alpha", 0, "--demos", "no/such/folder"], ["--demos", "no/such/folder", "manifest"]),
-]
-
-
-@pytest.mark.parametrize(
-    "module, flags, words",
-    [(dqn, *case) for case in BAD_DQN] + [(distill, *case) for case in BAD_DISTILL],
-    ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) and str(value[0])[:2] == "--" else "",
-)
-def test_a_wrong_value_is_one_line_and_creates_nothing(module, flags, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert_refused(module, capsys, flags, words)
-    assert not list(tmp_path.iterdir())
-
-
 def no_archive(folder: Path) -> None:
     (folder / "episode_00000.npz").write_bytes(b"no archive")
     sign(folder, folder / "episode_00000.npz")

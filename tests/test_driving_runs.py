@@ -224,44 +224,6 @@ def test_the_report_takes_whatever_is_done(expert, student, tmp_path):
 
 
 # What a user can get wrong
-BAD_DDPG = [
-    (["--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "Box actions"]),
-    (["--env-id", "NoSuchTask-v0"], ["NoSuchTask"]),
-    (["--track-name", "monza"], ["--track-name", "monza", "meadow"]),
-    (["--rollout-steps", 15], ["--rollout-steps", "15", "multiple", "50"]),
-    (["--total-timesteps", 50], ["--total-timesteps", "50", "100"]),
-    (["--batch-size", 64, "--buffer-size", 32], ["--batch-size", "64", "32"]),
-    (["--tau", 2], ["--tau", "2.0", "between 0 and 1"]),
-    (["--gamma", "nan"], ["--gamma", "nan"]),
-    (["--noise", "pink"], ["--noise", "pink"]),
-    (["--noise-std", -1], ["--noise-std", "-1.0"]),
-    (["--resume"], ["--resume", "--run-dir"]),
-]
-BAD_GAIL = [
-    (["--alpha", 0.5], ["--alpha", "0.5", "--demos-rl"]),
-    (["--alpha", 1.5], ["--alpha", "1.5", "between 0 and 1"]),
-    (["--alpha", 0, "--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "--demos-human"]),
-    (["--alpha", 0, "--max-kl", 0], ["--max-kl", "0.0"]),
-    (["--alpha", 0, "--num-steps", 1], ["--num-steps", "1"]),
-    (["--alpha", 0, "--total-timesteps", 100], ["--total-timesteps", "100", "2048"]),
-    (["--alpha", 0, "--total-timesteps", 0], ["--total-timesteps", "0", "--bc-epochs"]),
-    (["--alpha", 0, "--reward-form", "odd"], ["--reward-form", "odd"]),
-    (["--alpha", 1, "--demos-rl", "no/such/folder"], ["--demos-rl", "no/such/folder", "manifest"]),
-    (["--alpha", 0, "--demos-human", "no/such/folder"], ["--demos-human", "no/such/folder", "manifest"]),
-]
-
-
-@pytest.mark.parametrize(
-    "module, flags, words",
-    [(ddpg, *case) for case in BAD_DDPG] + [(gail, *case) for case in BAD_GAIL],
-    ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) and str(value[0])[:2] == "--" else "",
-)
-def test_a_wrong_value_is_one_line_and_creates_nothing(module, flags, words, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert_refused(module, capsys, flags, words)
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(
     "damage, words",
     [

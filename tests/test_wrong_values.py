@@ -1,0 +1,74 @@
+"""A wrong value of a flag: one line that names it, exit code 2, and nothing is made. PPO's are in test_command_line.py."""
+
+import pytest
+from conftest import assert_refused
+
+from cleanrl_thesis import ddpg_torcs_like as ddpg
+from cleanrl_thesis import distill_hybrid as distill
+from cleanrl_thesis import dqn_apple as dqn
+from cleanrl_thesis import gail_hybrid as gail
+
+BAD_DQN = [
+    (["--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "Discrete"]),
+    (["--env-id", "NoSuchGame-v0"], ["NoSuchGame"]),
+    (["--total-timesteps", 3, "--num-envs", 4], ["--total-timesteps", "4 frames"]),
+    (["--batch-size", 64, "--buffer-size", 32], ["--batch-size", "64", "32"]),
+    (["--end-e", "2"], ["--end-e", "2.0", "between 0 and 1"]),
+    (["--gamma", "nan"], ["--gamma", "nan"]),
+    (["--train-frequency", 0], ["--train-frequency", "0"]),
+    (["--n-step", 0], ["--n-step", "0"]),
+    (["--learning-rate", "-1"], ["--learning-rate"]),
+    (["--no-such-flag"], ["--no-such-flag"]),
+    (["--resume"], ["--resume", "--run-dir"]),
+]
+BAD_DISTILL = [
+    (["--alpha", 0.5], ["--alpha", "0.5", "--teacher"]),
+    (["--alpha", 1.5], ["--alpha", "1.5", "between 0 and 1"]),
+    (["--alpha", "nan"], ["--alpha", "nan"]),
+    (["--alpha", 0, "--temperature", -1], ["--temperature", "-1.0"]),
+    (["--alpha", 0, "--dropout", 1], ["--dropout", "1.0", "less than 1"]),
+    (["--alpha", 0, "--test-frames", 16_000], ["--test-frames", "16000"]),
+    (["--alpha", 0, "--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "--demos"]),
+    (["--alpha", 0, "--states", "mine"], ["--states", "mine"]),
+    (["--alpha", 0, "--states", "own"], ["--states", "own", "--teacher"]),
+    (["--alpha", 0, "--split", "episode", "--demo-frames", 1800], ["--split", "episode", "no episode to train on"]),
+    (["--teacher", "no/such/folder"], ["--teacher", "no/such/folder", "model.safetensors"]),
+    (["--alpha", 0, "--demos", "no/such/folder"], ["--demos", "no/such/folder", "manifest"]),
+]
+BAD_DDPG = [
+    (["--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "Box actions"]),
+    (["--env-id", "NoSuchTask-v0"], ["NoSuchTask"]),
+    (["--track-name", "monza"], ["--track-name", "monza", "meadow"]),
+    (["--rollout-steps", 15], ["--rollout-steps", "15", "multiple", "50"]),
+    (["--total-timesteps", 50], ["--total-timesteps", "50", "100"]),
+    (["--batch-size", 64, "--buffer-size", 32], ["--batch-size", "64", "32"]),
+    (["--tau", 2], ["--tau", "2.0", "between 0 and 1"]),
+    (["--gamma", "nan"], ["--gamma", "nan"]),
+    (["--noise", "pink"], ["--noise", "pink"]),
+    (["--noise-std", -1], ["--noise-std", "-1.0"]),
+    (["--resume"], ["--resume", "--run-dir"]),
+]
+BAD_GAIL = [
+    (["--alpha", 0.5], ["--alpha", "0.5", "--demos-rl"]),
+    (["--alpha", 1.5], ["--alpha", "1.5", "between 0 and 1"]),
+    (["--alpha", 0, "--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "--demos-human"]),
+    (["--alpha", 0, "--max-kl", 0], ["--max-kl", "0.0"]),
+    (["--alpha", 0, "--num-steps", 1], ["--num-steps", "1"]),
+    (["--alpha", 0, "--total-timesteps", 100], ["--total-timesteps", "100", "2048"]),
+    (["--alpha", 0, "--total-timesteps", 0], ["--total-timesteps", "0", "--bc-epochs"]),
+    (["--alpha", 0, "--reward-form", "odd"], ["--reward-form", "odd"]),
+    (["--alpha", 1, "--demos-rl", "no/such/folder"], ["--demos-rl", "no/such/folder", "manifest"]),
+    (["--alpha", 0, "--demos-human", "no/such/folder"], ["--demos-human", "no/such/folder", "manifest"]),
+]
+BAD = {dqn: BAD_DQN, distill: BAD_DISTILL, ddpg: BAD_DDPG, gail: BAD_GAIL}
+
+
+@pytest.mark.parametrize(
+    "module, flags, words",
+    [(module, *case) for module, cases in BAD.items() for case in cases],
+    ids=lambda value: " ".join(map(str, value)) if isinstance(value, list) and str(value[0])[:2] == "--" else "",
+)
+def test_a_wrong_value_is_one_line_and_creates_nothing(module, flags, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(module, capsys, flags, words)
+    assert not list(tmp_path.iterdir())
