@@ -58,7 +58,7 @@ def last_returns(args: Args, seed: int) -> list[float]:
     """Train by gail_hybrid.py's TRPO with the environment's rewards; returns of the last 50 episodes."""
     torch.manual_seed(seed)
     torch.set_num_threads(1)
-    settings = gail.Args(alpha=0.0, num_envs=1, num_steps=2_048, fisher_every=1, kl_slack=1.0)
+    settings = gail.Args(alpha=0.0, num_envs=1, num_steps=2_048, frame_skip=1, fisher_every=1, kl_slack=1.0)
     env = gym.make(args.env_id)
     space = env.action_space
     agent = gail.Agent(env.observation_space.shape[0], space.shape[0], settings.hidden_size)
@@ -68,7 +68,7 @@ def last_returns(args: Args, seed: int) -> list[float]:
     players.start()
     for _ in range(args.batches):
         players.rewards = []
-        rollout = gail.collect(agent, players, space, settings.num_steps, rng)
+        rollout = gail.collect(agent, players, space, settings, rng)
         batch = gail.make_batch(agent, rollout, np.array(players.rewards, np.float32)[:, None], space, settings, device)
         gail.trpo_step(policy, batch, settings)
         gail.update_values(agent, optimizer, batch, settings)

@@ -140,7 +140,9 @@ class Args:
     num_envs: int = 16
     """environments side by side"""
     num_steps: int = 128
-    """steps of each environment per update"""
+    """actions of each environment per update"""
+    frame_skip: int | None = None
+    """steps for which an action is held, of which demonstrations give the first; default: 5 for TorcsLike-v0, else 1"""
     g_steps: int = 3
     """updates of the policy for each round of the discriminator"""
     d_steps: int = 1
@@ -171,6 +173,8 @@ class Args:
     """weight of the policy's entropy"""
     d_ent_coef: float = 1e-3
     """weight of the discriminator's entropy"""
+    d_grad_penalty: float = 10.0
+    """weight of the discriminator's gradient penalty, between student and experts; 0: Eq. 2.3.1 as it stands"""
     reward_form: Literal["positive", "signed"] = "positive"
     """positive: −log D (Eq. 2.3.1), with which it pays to survive; signed: log(1 − D) − log D, with which it need not"""
     bc_epochs: int = 0
@@ -181,7 +185,7 @@ class Args:
 
     # to be filled in runtime
     batch_size: tyro.conf.Suppress[int] = 0
-    """num_envs · num_steps"""
+    """environment steps of an update: num_envs · num_steps · frame_skip"""
     num_iterations: tyro.conf.Suppress[int] = 0
     """total_timesteps // batch_size"""
 
@@ -223,17 +227,19 @@ def complete_args(args: Args) -> Args:
     if args.total_timesteps is None:
         args.total_timesteps = 5_000_000 if args.alpha == 0 else 7_500_000
     args.stop_at = max(1, args.total_timesteps) if args.stop_at is None else args.stop_at
+    if args.frame_skip is None:
+        args.frame_skip = 5 if is_driving(args.env_id) else 1
     counts = "num_threads num_envs eval_episodes checkpoint_interval stop_at human_episodes hidden_size"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         (
-            "g_steps d_steps value_epochs value_batch_size cg_iterations fisher_every",
+            "g_steps d_steps value_epochs value_batch_size cg_iterations fisher_every frame_skip",
             lambda x: x >= 1,
             "must be at least 1",
         ),
         ("learning_rate value_learning_rate max_kl", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("kl_slack", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
-        ("cg_damping ent_coef d_ent_coef", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
+        ("cg_damping ent_coef d_ent_coef d_grad_penalty", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
         ("alpha gamma gae_lambda", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
         ("save_demos bc_epochs", lambda x: x >= 0, "must be at least 0"),
@@ -251,12 +257,13 @@ def complete_args(args: Args) -> Args:
     require(
         has_human, "--env-id", args.env_id, "needs --demos-human for α < 1; only TorcsLike-v0 has a synthetic human"
     )
-    args.batch_size = args.num_envs * args.num_steps
+    args.batch_size = args.num_envs * args.num_steps * args.frame_skip
     args.num_iterations = args.total_timesteps // args.batch_size
     allowed = f"must be at least one batch, {args.batch_size} steps, or 0 with --bc-epochs"
     clones = args.total_timesteps == 0 and args.bc_epochs > 0
     require(args.num_iterations >= 1 or clones, "--total-timesteps", args.total_timesteps, allowed)
-    require(args.d_steps <= args.batch_size, "--d-steps", args.d_steps, f"must be at most a batch, {args.batch_size}")
+    actions = args.num_envs * args.num_steps
+    require(args.d_steps <= actions, "--d-steps", args.d_steps, f"must be at most the actions of a batch, {actions}")
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")
     if args.capture_video and importlib.util.find_spec("moviepy") is None:
@@ -727,15 +734,21 @@ class TorcsLikeVectorEnv(gym.vector.VectorEnv, TorcsRules):
         self.begin(self.all_cars)
         return self.cars.observe(self.all_cars), {}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(
+        self, actions: np.ndarray, observes: bool = True
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+        """Gymnasium's; without `observes`, which takes half of the time, all observations but the final ones are 0."""
         rewards, terminated, truncated, infos = self.drive(np.asarray(actions))
-        obs, over = self.cars.observe(self.all_cars), terminated | truncated
-        if over.any():
-            infos |= {"final_obs": obs, "_final_obs": over}
-            ended = over.nonzero()[0]
+        over = terminated | truncated
+        ended = over.nonzero()[0]
+        obs = self.cars.observe(self.all_cars) if observes else np.zeros((self.num_envs, 65), np.float32)
+        if len(ended):
+            infos |= {"final_obs": obs.copy(), "_final_obs": over}
+            if not observes:
+                infos["final_obs"][ended] = self.cars.observe(ended)
             self.begin(ended)
-            obs = obs.copy()
-            obs[ended] = self.cars.observe(ended)
+            if observes:
+                obs[ended] = self.cars.observe(ended)
         return obs, rewards, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...]:
@@ -966,11 +979,11 @@ def read_demonstrations(folder: Path, args: Args, flag: str) -> list[dict[str, n
 
 
 class Demonstrations:
-    """Steps of one expert, from which the discriminator's minibatches are drawn."""
+    """Steps of one expert at which the student would act, from which the discriminator's minibatches are drawn."""
 
-    def __init__(self, episodes: list[dict[str, np.ndarray]], space: gym.spaces.Box):
-        obs = np.concatenate([episode["observations"][:-1] for episode in episodes])
-        actions = np.concatenate([episode["actions"] for episode in episodes])
+    def __init__(self, episodes: list[dict[str, np.ndarray]], space: gym.spaces.Box, frame_skip: int):
+        obs = np.concatenate([episode["observations"][:-1:frame_skip] for episode in episodes])
+        actions = np.concatenate([episode["actions"][::frame_skip] for episode in episodes])
         self.obs = torch.from_numpy(obs.astype(np.float32))  # (S, O)
         self.actions = torch.from_numpy(bounded(actions.astype(np.float32), space.low, space.high))  # (S, A)
         self.digest = hashlib.sha256(self.obs.numpy().tobytes() + self.actions.numpy().tobytes()).hexdigest()
@@ -1052,8 +1065,8 @@ class GymPlayers:
         self.actions[i], self.returns[i] = [], 0.0
         self.obs[i] = self.envs[i].reset(seed=episode_seed(self.seed, i, self.numbers[i]))[0]
 
-    def step(self, actions: np.ndarray) -> Steps:
-        """Apply an action (N, A) to each environment; begin anew those whose episode ends."""
+    def step(self, actions: np.ndarray, observes: bool = True) -> Steps:
+        """Apply an action (N, A) to each environment; begin anew those whose episode ends. It observes in any case."""
         rewards, terminated, ended = np.zeros(len(self.envs)), np.zeros(len(self.envs), bool), []
         over = []
         for i, env in enumerate(self.envs):
@@ -1104,9 +1117,10 @@ class CarPlayers:
             self.numbers[i] += 1
             self.seed_next(i)
 
-    def step(self, actions: np.ndarray) -> Steps:
+    def step(self, actions: np.ndarray, observes: bool = True) -> Steps:
+        """As above; without `observes`, only the observations of episodes that end."""
         lengths = self.games.cars.steps + 1
-        self.obs, rewards, terminated, truncated, infos = self.games.step(actions)
+        self.obs, rewards, terminated, truncated, infos = self.games.step(actions, observes)
         self.returns += rewards
         ended = []
         for i in np.flatnonzero(terminated | truncated):
@@ -1127,6 +1141,39 @@ class CarPlayers:
         for i in range(self.games.num_envs):
             self.seed_next(i)
         return np.array_equal(self.games.cars.observe(self.games.all_cars), self.obs)
+
+
+def step_and_hold(players: GymPlayers | CarPlayers, actions: np.ndarray, frame_skip: int) -> Steps:
+    """Hold actions (N, A) for `frame_skip` steps, with the sums of rewards until an episode's end.
+
+    An episode that begins on the way is driven by the same action, and its steps until then are not learned from.
+    """
+    if frame_skip == 1:
+        return players.step(actions)
+    goes_on, terminated = np.ones(len(actions), bool), np.zeros(len(actions), bool)
+    next_obs, rewards, ended = np.zeros_like(players.obs), np.zeros(len(actions)), []
+    for t in range(frame_skip):
+        steps = players.step(actions, observes=t == frame_skip - 1)
+        next_obs[goes_on] = steps.next_obs[goes_on]
+        rewards += goes_on * steps.rewards
+        terminated |= goes_on & steps.terminated
+        ended += steps.ended
+        goes_on[[i for i, _, _ in steps.ended]] = False
+    return Steps(next_obs, rewards, terminated, ended)
+
+
+def held(policy, frame_skip: int):
+    """A policy that acts anew every `frame_skip` steps, from the first on."""
+    steps, actions = 0, None
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        nonlocal steps, actions
+        if steps % frame_skip == 0:
+            actions = policy(obs)
+        steps += 1
+        return actions
+
+    return act
 
 
 def make_players(args: Args) -> GymPlayers | CarPlayers:
@@ -1174,9 +1221,13 @@ class Agent(nn.Module):
         """Normalised observations (B, O) -> values (B,)."""
         return self.critic(obs).squeeze(1)
 
-    def logits(self, obs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Normalised observations (B, O), actions (B, A) -> logit of D, (B,): large for the student, small for experts."""
-        return self.discriminator(torch.cat([obs, actions], 1)).squeeze(1)
+    def pairs(self, obs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Observations (B, O) as the environment gives them, actions (B, A) -> the discriminator's inputs, (B, O + A)."""
+        return torch.cat([self.normalise(obs), actions], 1)
+
+    def logits(self, pairs: torch.Tensor) -> torch.Tensor:
+        """Inputs (B, O + A) -> logit of D, (B,): large for the student, small for experts."""
+        return self.discriminator(pairs).squeeze(1)
 
 
 def numpy_mean(agent: Agent):
@@ -1196,7 +1247,7 @@ def numpy_mean(agent: Agent):
 
 
 class Rollout(NamedTuple):
-    """T steps of N environments, as arrays."""
+    """T actions in each of N environments, as arrays."""
 
     obs: np.ndarray  # (T, N, O)
     actions: np.ndarray  # (T, N, A), as sampled
@@ -1206,20 +1257,20 @@ class Rollout(NamedTuple):
     episodes: list[tuple[int, float, int]]  # step of the rollout, return and length of each episode that ended
 
 
-def collect(agent: Agent, players: GymPlayers | CarPlayers, space: gym.spaces.Box, num_steps: int, rng) -> Rollout:
-    """Sample the policy for `num_steps` steps of each environment."""
+def collect(agent: Agent, players: GymPlayers | CarPlayers, space: gym.spaces.Box, args: Args, rng) -> Rollout:
+    """Sample `--num-steps` actions for each environment."""
     mean, deviation = numpy_mean(agent), agent.actor_logstd.detach().exp().cpu().numpy()
     columns: dict[str, list[np.ndarray]] = {name: [] for name in ("obs", "actions", "next_obs", "terminated", "ended")}
     episodes = []
-    for t in range(num_steps):
+    for t in range(args.num_steps):
         obs = players.obs.copy()
         actions = mean(obs)
         actions += deviation * rng.standard_normal(actions.shape, np.float32)
-        steps = players.step(bounded(actions, space.low, space.high))
+        steps = step_and_hold(players, bounded(actions, space.low, space.high), args.frame_skip)
         ended = np.zeros(len(obs), bool)
         for i, episodic_return, length in steps.ended:
             ended[i] = True
-            episodes.append(((t + 1) * len(obs), episodic_return, length))
+            episodes.append(((t + 1) * len(obs) * args.frame_skip, episodic_return, length))
         for name, array in zip(columns, (obs, actions, steps.next_obs, steps.terminated, ended)):
             columns[name].append(array)
     return Rollout(*(np.stack(column) for column in columns.values()), episodes)
@@ -1267,6 +1318,17 @@ def discriminator_loss(
     return -l_mix - ent_coef * entropy, {"losses/l_mix": l_mix.detach(), **metrics}
 
 
+def gradient_penalty(logits, student: torch.Tensor, expert: torch.Tensor) -> torch.Tensor:
+    """How far the logit's gradient is from length 1 on the ways from student to expert (Gulrajani et al. 2017, Eq. 3).
+
+    Inputs of the discriminator (M, O + A), paired at random; the result is a scalar, the mean square.
+    """
+    share = torch.rand(len(student), 1, device=student.device)
+    between = (share * student + (1 - share) * expert).requires_grad_()
+    (gradient,) = torch.autograd.grad(logits(between).sum(), between, create_graph=True)
+    return (gradient.norm(dim=1) - 1).square().mean()
+
+
 def imitation_reward(logits: torch.Tensor, form: str) -> torch.Tensor:
     """What the student is paid, (B,): −log D (Eq. 2.3.1), or log(1 − D) − log D."""
     # −log D is always positive: where episodes end early it pays to survive, whatever the experts do.
@@ -1302,7 +1364,7 @@ def flat_tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
 def pay(agent: Agent, rollout: Rollout, space: gym.spaces.Box, form: str, device: torch.device) -> np.ndarray:
     """The student's rewards by the discriminator, (T, N)."""
     seen = bounded(rollout.actions, space.low, space.high)
-    logits = agent.logits(agent.normalise(flat_tensor(rollout.obs, device)), flat_tensor(seen, device))
+    logits = agent.logits(agent.pairs(flat_tensor(rollout.obs, device), flat_tensor(seen, device)))
     return imitation_reward(logits, form).cpu().numpy().reshape(rollout.ended.shape)
 
 
@@ -1428,11 +1490,12 @@ def update_discriminator(
     """One round of the discriminator: as many steps of each expert as of the student."""
     totals: dict[str, float] = {}
     for inds in torch.randperm(len(batch.obs)).chunk(args.d_steps):
-        parts = [agent.logits(batch.obs[inds], batch.seen[inds])]
-        parts += [
-            agent.logits(agent.normalise(obs), seen) for obs, seen in (demos.sample(len(inds)) for demos in experts)
-        ]
-        loss, metrics = discriminator_loss(*parts, args.alpha, args.d_ent_coef)
+        student = torch.cat([batch.obs[inds], batch.seen[inds]], 1)
+        rl, human = (agent.pairs(*demos.sample(len(inds))) for demos in experts)
+        loss, metrics = discriminator_loss(*map(agent.logits, (student, rl, human)), args.alpha, args.d_ent_coef)
+        if args.d_grad_penalty:
+            penalties = [gradient_penalty(agent.logits, student, expert) for expert in (rl, human)]
+            loss = loss + args.d_grad_penalty * (args.alpha * penalties[0] + (1 - args.alpha) * penalties[1])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -1726,10 +1789,12 @@ def evaluate(agent: Agent, args: Args, run_dir: Path) -> dict:
     space = make_env(args.env_id, **env_options(args)).action_space
     evaluation = {"env_id": args.env_id, "seeds": seeds}
     for mode in MODES:
-        episodes = play(make_policy(agent, mode, space, args.seed), make_games(args, len(seeds)), seeds)
+        policy = held(make_policy(agent, mode, space, args.seed), args.frame_skip)
+        episodes = play(policy, make_games(args, len(seeds)), seeds)
         evaluation[mode] = {"mode": mode, **measured(episodes, args)}
     if args.capture_video:
-        record_video(make_policy(agent, args.eval_mode, space, args.seed), args, run_dir, seeds[0])
+        policy = held(make_policy(agent, args.eval_mode, space, args.seed), args.frame_skip)
+        record_video(policy, args, run_dir, seeds[0])
     write_json(run_dir / "evaluation.json", evaluation)
     return evaluation
 
@@ -1754,7 +1819,7 @@ def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
     """Write `--save-demos` episodes of the student into `demos/`."""
     seeds = [episode_seed(args.seed, STUDENT_STREAM, i) for i in range(args.save_demos)]
     policy = make_policy(agent, args.eval_mode, make_env(args.env_id, **env_options(args)).action_space, args.seed)
-    episodes = play(policy, make_games(args, len(seeds)), seeds, keep=True)
+    episodes = play(held(policy, args.frame_skip), make_games(args, len(seeds)), seeds, keep=True)
     about = {"player": f"{args.exp_name}, alpha {args.alpha}", "mode": args.eval_mode}
     write_demonstrations(run_dir / "demos", episodes, {"env_id": args.env_id, "options": env_options(args), **about})
 
@@ -1880,7 +1945,7 @@ def main(args: Args) -> int:
         check_video(args.env_id)
     torch.set_num_threads(args.num_threads)
     human, rl = human_episodes(args), rl_episodes(args)
-    experts = Experts(Demonstrations(rl or human, space), Demonstrations(human or rl, space))
+    experts = Experts(*(Demonstrations(part, space, args.frame_skip) for part in (rl or human, human or rl)))
     about_experts = {name: measured(part, args) for name, part in (("rl", rl), ("human", human)) if part}
     run_dir, checkpoint = open_run_dir(args)
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / args.batch_size))
@@ -1951,7 +2016,7 @@ def main(args: Args) -> int:
 
     while iteration < last_iteration:
         iteration += 1
-        rollout = collect(agent, players, space, args.num_steps, rng)
+        rollout = collect(agent, players, space, args, rng)
         rewards = pay(agent, rollout, space, args.reward_form, device)
         batch = make_batch(agent, rollout, rewards, space, args, device)
         metrics = {"charts/imitation_reward": float(rewards.mean()), **trpo_step(policy, batch, args)}

@@ -294,13 +294,37 @@ def test_an_action_is_held_until_its_end_or_the_episode_s():
     """Rewards are summed up to the end of the episode; what the next one does with the rest of the action is left out."""
     players = ddpg.GymPlayers([Counter(), Counter()], seed=0)
     players.start()
-    players.step(np.zeros((2, 1)))
+    ddpg.step_and_hold(players, np.zeros((2, 1)), 1)
     steps = ddpg.step_and_hold(players, np.zeros((2, 1)), 2)
     assert (steps.next_obs[:, 0].tolist(), steps.rewards.tolist(), steps.ended) == ([3, 3], [2, 2], [])
     steps = ddpg.step_and_hold(players, np.zeros((2, 1)), 3)
     assert steps.next_obs[:, 0].tolist() == [4, 4] and steps.rewards.tolist() == [1, 1]
     assert steps.terminated.tolist() == [True, True] and [i for i, _, _ in steps.ended] == [0, 1]
     assert players.obs[:, 0].tolist() == [2, 2]
+
+
+def test_held_cars_are_those_whose_sensors_work_in_every_step():
+    """The steps between are driven without sensors: same rewards, ends and observations, through crashes."""
+    players, others = (ddpg.CarPlayers(ddpg.TorcsLikeVectorEnv(3), seed=5) for _ in range(2))
+    rng, ends = np.random.default_rng(0), 0
+    for each in (players, others):
+        each.start()
+    for _ in range(150):
+        actions = rng.uniform([0, 0.2], [0.3, 1], (3, 2))
+        held = ddpg.step_and_hold(players, actions, 5)
+        ended, rewards, terminated = [], np.zeros(3), np.zeros(3, bool)
+        next_obs = np.zeros((3, 65), np.float32)
+        for _ in range(5):
+            steps = others.step(actions)
+            for i in {0, 1, 2} - {i for i, _, _ in ended}:
+                rewards[i] += steps.rewards[i]
+                next_obs[i], terminated[i] = steps.next_obs[i], steps.terminated[i]
+            ended += steps.ended
+        ends += len(ended)
+        assert held.ended == ended and np.array_equal(players.obs, others.obs)
+        assert np.array_equal(held.next_obs, next_obs)
+        assert np.array_equal(held.rewards, rewards) and np.array_equal(held.terminated, terminated)
+    assert ends > 3
 
 
 def test_a_held_policy_acts_anew_every_few_steps():

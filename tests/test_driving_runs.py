@@ -1,6 +1,7 @@
 """ddpg_torcs_like.py and gail_hybrid.py through the command line: runs, resumes, and what a user can get wrong."""
 
 import csv
+import importlib
 import json
 import shutil
 import signal
@@ -24,7 +25,20 @@ SMALL_DDPG = [
     *("--keep-best-every", 2_000),
 ]
 SMALL_GAIL = [
-    *("--total-timesteps", 5_120, "--num-envs", 4, "--num-steps", 64, "--human-episodes", 2, "--hidden-size", 16),
+    *(
+        "--total-timesteps",
+        5_120,
+        "--num-envs",
+        4,
+        "--num-steps",
+        32,
+        "--frame-skip",
+        2,
+        "--human-episodes",
+        2,
+        "--hidden-size",
+        16,
+    ),
     *("--checkpoint-interval", 1, "--eval-episodes", 2),
 ]
 RECORDS = ("episodes.csv", "updates.csv", "evaluation.json")
@@ -223,7 +237,17 @@ def test_the_report_takes_whatever_is_done(expert, student, tmp_path):
         assert len(list(csv.DictReader(file))) == 2 + 1 + 2 * 2
 
 
-# What a user can get wrong
+def test_a_saved_expert_drives_as_it_was_evaluated(expert, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmark")
+    players = importlib.import_module("torcs_players")
+    evaluation = json.loads((expert / "evaluation.json").read_text())
+    episodes = ddpg.play(players.load_expert(expert), ddpg.TorcsLikeVectorEnv(2), evaluation["seeds"])
+    assert [episode["rewards"].sum() for episode in episodes] == evaluation["returns"]
+    monkeypatch.setattr(ddpg, "EPISODE_STEPS", ddpg.EPISODE_STEPS)
+    laps = players.lap_row(expert, 1)
+    assert laps["episodes"] == 20 and laps["whole laps"] == 0 and laps["fastest, s"] == ""
+
+
 @pytest.mark.parametrize(
     "damage, words",
     [

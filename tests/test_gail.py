@@ -191,7 +191,7 @@ def test_demonstrations_are_normalised_and_within_bounds():
     space = gym.spaces.Box(-1, 1, (2,), np.float32)
     rng = np.random.default_rng(0)
     episode = {"observations": rng.normal(3, 2, (1_001, 4)), "actions": rng.normal(0, 2, (1_000, 2))}
-    demonstrations = gail.Demonstrations([episode], space)
+    demonstrations = gail.Demonstrations([episode], space, 1)
     assert demonstrations.actions.abs().max() == 1 and len(demonstrations.obs) == 1_000
     agent = gail.Agent(4, 2, 8)
     agent.set_normalisation(demonstrations.obs)
@@ -201,6 +201,76 @@ def test_demonstrations_are_normalised_and_within_bounds():
     for row, action in zip(obs, actions):
         i = (demonstrations.obs == row).all(1).nonzero()[0, 0]
         assert torch.equal(demonstrations.actions[i], action)
+
+
+def test_demonstrations_are_the_steps_at_which_a_student_with_frame_skip_acts():
+    rng = np.random.default_rng(0)
+    lengths = (12, 10, 3)  # each episode begins anew
+    episodes = [{"observations": rng.random((n + 1, 4)), "actions": rng.random((n, 2))} for n in lengths]
+    demonstrations = gail.Demonstrations(episodes, gym.spaces.Box(-1, 1, (2,), np.float32), 5)
+    steps = [(0, 0), (0, 5), (0, 10), (1, 0), (1, 5), (2, 0)]
+    for got, name in ((demonstrations.obs, "observations"), (demonstrations.actions, "actions")):
+        assert np.array_equal(got, np.array([episodes[i][name][t] for i, t in steps], np.float32))
+
+
+def test_a_rollout_holds_each_action():
+    args = gail.Args(num_envs=3, num_steps=4, frame_skip=5)
+    torch.manual_seed(0)
+    agent, players = gail.Agent(65, 2, 8), gail.make_players(args)
+    players.start()
+    cars = gail.make_players(args)
+    cars.start()
+    space = gail.make_env(args.env_id).action_space
+    rollout = gail.collect(agent, players, space, args, np.random.default_rng(0))
+    assert rollout.actions.shape == (4, 3, 2) and players.games.cars.steps.tolist() == [20] * 3
+    for obs, actions, next_obs in zip(rollout.obs, rollout.actions, rollout.next_obs):
+        assert np.array_equal(obs, cars.obs)
+        for _ in range(5):
+            cars.step(gail.bounded(actions, space.low, space.high))
+        assert np.array_equal(next_obs, cars.obs)
+
+
+def test_gradient_penalty():
+    """Of a plane it is (slope - 1)²; of a network, the mean over points between, by differences in double precision."""
+    torch.manual_seed(0)
+    student, expert = torch.randn(2, 40, 5, dtype=torch.float64)
+    slope = torch.tensor([0.0, 3.0, 0.0, -4.0, 0.0], dtype=torch.float64)
+    assert gail.gradient_penalty(lambda x: x @ slope, student, expert).item() == pytest.approx((5 - 1) ** 2)
+
+    logits = torch.nn.Sequential(torch.nn.Linear(5, 7), torch.nn.Tanh(), torch.nn.Linear(7, 1)).double()
+    torch.manual_seed(1)
+    penalty = gail.gradient_penalty(logits, student, expert)
+    torch.manual_seed(1)
+    share = torch.rand(40, 1)
+    between, step = expert + share * (student - expert), 1e-6 * torch.eye(5, dtype=torch.float64)
+    with torch.no_grad():
+        gradients = [(logits(between + axis) - logits(between - axis)) / 2e-6 for axis in step]
+    lengths = torch.cat(gradients, 1).norm(dim=1)
+    assert penalty.item() == pytest.approx(((lengths - 1) ** 2).mean().item(), rel=1e-6)
+    penalty.backward()
+    assert logits[0].weight.grad.abs().max() > 0
+
+
+def test_the_discriminator_learns_with_and_without_its_penalty():
+    """Experts at +1, student at -1: logits get the right signs, and with the penalty they stay as steep as 1."""
+    space, args = gym.spaces.Box(-2, 2, (1,)), gail.Args(alpha=0.25, d_grad_penalty=0.0)
+    episode = {"observations": np.zeros((1_001, OBS)), "actions": np.ones((1_000, 1))}
+    experts = gail.Experts(*(gail.Demonstrations([episode], space, 1) for _ in range(2)))
+    obs, actions = torch.zeros(500, OBS), -torch.ones(500, 1)
+    batch = gail.Batch(obs, actions, actions, torch.zeros(500), torch.zeros(500))
+    steepness = {}
+    for weight in (0.0, 10.0):
+        torch.manual_seed(0)
+        agent, args.d_grad_penalty = gail.Agent(OBS, 1, 32), weight
+        optimizer = torch.optim.Adam(agent.discriminator.parameters(), 1e-3)
+        for _ in range(600):
+            metrics = gail.update_discriminator(agent, optimizer, batch, experts, args)
+        assert metrics["discriminator/accuracy_student"] == metrics["discriminator/accuracy_human"] == 1
+        with torch.no_grad():
+            student, expert = (agent.logits(torch.cat([obs[:1], a[:1]], 1)).item() for a in (actions, -actions))
+        assert student > 0 > expert
+        steepness[weight] = (student - expert) / 2
+    assert steepness[10.0] == pytest.approx(1, abs=0.1) and steepness[0.0] > 3
 
 
 @pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Hopper-v5"])
@@ -244,7 +314,7 @@ def test_behaviour_cloning_mixes_two_actions_into_one_between_them():
 
     def expert(action: float) -> gail.Demonstrations:
         observations = rng.standard_normal((2_001, OBS))
-        return gail.Demonstrations([{"observations": observations, "actions": np.full((2_000, 1), action)}], space)
+        return gail.Demonstrations([{"observations": observations, "actions": np.full((2_000, 1), action)}], space, 1)
 
     torch.manual_seed(0)
     agent = gail.Agent(OBS, 1, 16)
