@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# The driving task: a DDPG expert for each seed, hybrids over α, and clones of the drivers' actions alone; the runs behind
-# benchmark/results/torcs/. Can be sent again after every stop. Each seed takes 1.1 GB of disk.
+# The driving task: a DDPG expert for each seed (45 minutes), hybrids over α (4 minutes each), those of α = 0.5 without the
+# discriminator's penalty, and clones of the drivers' actions alone; the runs behind benchmark/results/torcs/. Can be sent
+# again after every stop. Each seed takes 1.1 GB of disk.
 #   benchmark/torcs_alpha.sh
 #   SEEDS="1" ALPHAS="0.5" WORKERS=1 benchmark/torcs_alpha.sh
 set -euo pipefail
@@ -26,5 +27,6 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
   for alpha in $ALPHAS; do
     for seed in $SEEDS; do student "$seed" "$alpha" "alpha$alpha"; done
   done
+  for seed in $SEEDS; do student "$seed" 0.5 penalty0_alpha0.5 --d-grad-penalty 0; done
 } | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/gail_hybrid.py --save-model --save-demos 20 --eval-episodes 100 --resume
 "$PYTHON" benchmark/torcs_report.py --runs "$RUNS"

@@ -95,6 +95,7 @@ def table_2_3(rows: list[dict]) -> str:
     groups = {
         "DDPG": [("demonstrations", "expert"), ("evaluation", "expert")],
         "hybrid, α = 0.5": [(mode, "alpha0.5") for mode in MODES],
+        "the same without penalty": [(mode, "penalty0_alpha0.5") for mode in MODES],
         "human": [("demonstrations", "human")],
         "GAIL, α = 0": [(mode, "alpha0.0") for mode in MODES],
         "GAIL on DDPG, α = 1": [(mode, "alpha1.0") for mode in MODES],

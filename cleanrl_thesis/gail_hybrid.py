@@ -20,7 +20,9 @@ agent, and scores 461 (km/h) s; Table 2.3 has the human at 0.78 of its DDPG. `--
 | KL bound, discriminator's learning rate | 0.01, 1e-3 | section 2.4.3 |
 | networks | two layers of 100 with tanh, for policy, values and discriminator | the study's code |
 | updates of the policy for one of the discriminator | 3 | the study's code |
-| batch | 128 steps in each of 16 environments | ours; the study's code has 1,024 steps in one for GAIL, 512 for the hybrid |
+| batch | 64 actions in each of 16 environments | ours; the study's code has 1,024 in one for GAIL, 512 for the hybrid |
+| an action is held, while driving | for 5 steps, 0.1 s, as by `ddpg_torcs_like.py` | ours; the study's code acts in each step |
+| penalty on the discriminator's gradient | 1 (`--d-grad-penalty 0`: Eq. 2.3.1 alone) | ours, after Gulrajani et al. 2017 |
 | Fisher matrix | from a fifth of a batch | OpenAI Baselines' |
 | actions that the discriminator sees | within the bounds | ours; the study's code shows them as sampled |
 | CG iterations, damping; γ, λ; passes over the value function, rate; entropies | 10, 0.1; 0.995, 0.97; 5, 1e-3; 0, 1e-3 | the study's code |
@@ -139,7 +141,7 @@ class Args:
     """environment steps; default: 5,000,000 for α = 0, else 7,500,000 (section 2.4.3)"""
     num_envs: int = 16
     """environments side by side"""
-    num_steps: int = 128
+    num_steps: int = 64
     """actions of each environment per update"""
     frame_skip: int | None = None
     """steps for which an action is held, of which demonstrations give the first; default: 5 for TorcsLike-v0, else 1"""
@@ -173,8 +175,8 @@ class Args:
     """weight of the policy's entropy"""
     d_ent_coef: float = 1e-3
     """weight of the discriminator's entropy"""
-    d_grad_penalty: float = 10.0
-    """weight of the discriminator's gradient penalty, between student and experts; 0: Eq. 2.3.1 as it stands"""
+    d_grad_penalty: float = 1.0
+    """weight of the penalty on the discriminator's gradient between student and experts; 0: Eq. 2.3.1 as it stands"""
     reward_form: Literal["positive", "signed"] = "positive"
     """positive: −log D (Eq. 2.3.1), with which it pays to survive; signed: log(1 − D) − log D, with which it need not"""
     bc_epochs: int = 0
