@@ -4,7 +4,8 @@
     python benchmark/torcs_players.py --seed 1 --demos runs/torcs/human_seed1  # 220 episodes of 60 s
 
 `--calibrate` measures the driver at several values of its boldness, which was fitted, as was its spread: the score is to
-stand to the experts' as 637 to 819 (Table 2.3), without a crash, for the people of Table 2.3 never scored below 588. Each expert also drives one whole lap from standstill, for which 60 s are not quite enough, in other episodes.
+stand to the experts' as 637 to 819 (Table 2.3), without a crash, for the people of Table 2.3 never scored below 588. Each
+expert also drives one whole lap from standstill, for which 60 s are not quite enough, in other episodes.
 """
 
 import json
