@@ -1,16 +1,16 @@
 #!/usr/bin/env bash
-# The driving task: a DDPG expert for each seed (45 minutes), hybrids over α (4 minutes each), those of α = 0.5 without the
-# discriminator's penalty, and clones of the drivers' actions alone; the runs behind benchmark/results/torcs/. Can be sent
-# again after every stop. Each seed takes 1.1 GB of disk.
+# The driving task: DDPG experts (45 minutes each), the first of which the students learn from; hybrids over α (4 minutes
+# each), those of α = 0.5 without the discriminator's penalty, and clones of the drivers' actions alone: the runs behind
+# benchmark/results/torcs/. Can be sent again after every stop. An expert takes 0.9 GB of disk.
 #   benchmark/torcs_alpha.sh
 #   SEEDS="1" ALPHAS="0.5" WORKERS=1 benchmark/torcs_alpha.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
-SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/torcs}
+EXPERTS=${EXPERTS:-1 2} SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/torcs}
 ALPHAS=${ALPHAS:-0.5 0.0 1.0 0.7 0.3 0.9 0.1 0.8 0.2 0.6 0.4}
 MIXED=${MIXED:-0.5 0.0 1.0}
 mkdir -p "$RUNS"
-for seed in $SEEDS; do
+for seed in $EXPERTS; do
   echo "--seed $seed --run-dir $RUNS/expert_seed$seed"
 done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220 --resume
 for seed in $SEEDS; do
@@ -18,7 +18,7 @@ for seed in $SEEDS; do
   [ -e "$human/manifest.json" ] || "$PYTHON" benchmark/torcs_players.py --seed "$seed" --demos "$human"
 done
 student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
-  echo --seed "$1" --alpha "$2" --demos-rl "$RUNS/expert_seed$1/demos" --demos-human "$RUNS/human_seed$1" --run-dir "$RUNS/$3_seed$1" "${@:4}"
+  echo --seed "$1" --alpha "$2" --demos-rl "$RUNS/expert_seed${EXPERTS%% *}/demos" --demos-human "$RUNS/human_seed$1" --run-dir "$RUNS/$3_seed$1" "${@:4}"
 }
 {
   for alpha in $MIXED; do
