@@ -879,7 +879,7 @@ def numpy_actions(parameters: dict[str, np.ndarray], obs: np.ndarray) -> np.ndar
 # Playing, and the replay buffer
 # ---------------------------------------------------------------------------------------------------------------------
 EVALUATION_STREAM, DEMONSTRATION_STREAM = 1_000_000, 1_000_001
-SELECTION_STREAM, SELECTION_EPISODES = 1_000_004, 200  # with 20, one that crashes in 6 of 200 was taken for the best
+SELECTION_STREAM, SELECTION_EPISODES = 1_000_004, 200
 
 
 @functools.lru_cache
@@ -1205,7 +1205,10 @@ class ActionNoise:
 
 
 class Best:
-    """The policy with the best mean return in the evaluations for `--keep-best-every`, if there were any."""
+    """The policy whose return in the evaluations for `--keep-best-every` has the highest mean less its deviation.
+
+    By the mean alone a fast one that crashes in 9 of 200 episodes was kept, and not one that never crashed.
+    """
 
     def __init__(self, optimizer: "FlatAdam", norm: RunningNorm):
         self.optimizer, self.norm = optimizer, norm
@@ -1213,13 +1216,13 @@ class Best:
         self.step, self.score, self.last_score = 0, -math.inf, math.nan
 
     def consider(self, args: Args, space: gym.spaces.Box, step: int) -> None:
-        """Evaluate the present policy, and keep it where none was better."""
+        """Evaluate the present policy, and keep it where none was better; `last_score` is the mean of its returns."""
         seeds = [episode_seed(args.seed, SELECTION_STREAM, i) for i in range(SELECTION_EPISODES)]
         policy = held(make_policy(self.optimizer, self.norm, space), args.frame_skip)
-        episodes = play(policy, make_games(args, len(seeds)), seeds)
-        self.last_score = float(np.mean([episode["rewards"].sum() for episode in episodes]))
-        if self.last_score >= self.score:
-            self.step, self.score = step, self.last_score
+        returns = [episode["rewards"].sum() for episode in play(policy, make_games(args, len(seeds)), seeds)]
+        self.last_score, score = float(np.mean(returns)), float(np.mean(returns) - np.std(returns))
+        if score >= self.score:
+            self.step, self.score = step, score
             self.actor.copy_(self.optimizer.vector[: self.optimizer.actor_size])
             self.scale.copy_(self.norm.scale)
 

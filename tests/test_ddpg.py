@@ -333,12 +333,12 @@ def test_a_held_policy_acts_anew_every_few_steps():
 
 
 def test_the_best_policy_is_kept(monkeypatch):
-    """Of evaluations with returns 1, 3, 2: the second; restored with the normalisation that it had."""
+    """Of mean returns 1, 3 and 4, the last with a deviation of 2: the second; with the normalisation that it had."""
     args, _, optimizer, update, _ = make()
     best, space = ddpg.Best(optimizer, update.norm), gym.spaces.Box(-1, 1, (ACTIONS,))
-    returns, vectors, scales = iter([1.0, 3.0, 2.0]), [], []
+    returns, vectors, scales = iter([(1.0, 1.0), (3.0, 3.0), (2.0, 6.0)]), [], []
     monkeypatch.setattr(ddpg, "make_games", lambda args, number: None)
-    monkeypatch.setattr(ddpg, "play", lambda *_: [{"rewards": np.array([next(returns)])}])
+    monkeypatch.setattr(ddpg, "play", lambda *_: [{"rewards": np.array([value])} for value in next(returns)])
     for step in (10, 20, 30):
         vectors.append(optimizer.vector.clone())
         scales.append(update.norm.scale.clone())
@@ -351,5 +351,6 @@ def test_the_best_policy_is_kept(monkeypatch):
     size = optimizer.actor_size
     assert torch.equal(optimizer.vector[:size], vectors[1][:size]) and torch.equal(update.norm.scale, scales[1])
     assert not torch.equal(optimizer.vector[size:], vectors[1][size:]) and (again.step, again.score) == (20, 3.0)
+    assert best.last_score == 4
     obs = np.ones((2, OBS), np.float32)
     assert np.allclose(update.norm(obs), (obs - scales[1][0].numpy()) / scales[1][1].numpy())
