@@ -31,14 +31,16 @@ TREMBLE = 0.05  # a turn of the wheel by less of its lock is not counted as a ch
 class Args:
     runs: Path = Path("runs/torcs")
     """folder of the runs' folders"""
+    expert: int = 1
+    """seed of the expert that the students learned from"""
     out: Path = ROOT / "benchmark" / "results" / "torcs"
     """folder for tables and figures"""
     note: str = ""
     """a sentence put above the tables, on what the runs do not record themselves"""
 
 
-def read_runs(folder: Path) -> list[dict]:
-    """A row for every finished run and way to act, and for the demonstrations of each seed's experts."""
+def read_runs(folder: Path, expert: int) -> list[dict]:
+    """A row for every finished run and way to act, and for all demonstrations; experts but one are of kind `other`."""
     rows = []
     for path in sorted(folder.glob("*_seed*/result.json")):
         result, args = json.loads(path.read_text()), json.loads((path.parent / "args.json").read_text())
@@ -55,6 +57,9 @@ def read_runs(folder: Path) -> list[dict]:
             track = gail.Track(*gail.TRACKS[json.loads(path.read_text())["options"]["track"]])
             driving = gail.driving_scores(read_episodes(path.parent, 10_000), track.length)
             rows.append(run_row(run, "demonstrations", driving, {}))
+    for row in rows:
+        if row["kind"] == "expert" and row["seed"] != expert:
+            row["kind"] = "other"
     return rows
 
 
@@ -94,6 +99,7 @@ def table_2_3(rows: list[dict]) -> str:
     expert, _ = interval([row["mean"] for row in select(rows, "expert", "demonstrations")])
     groups = {
         "DDPG": [("demonstrations", "expert"), ("evaluation", "expert")],
+        "other DDPG experts": [("evaluation", "other")],
         "hybrid, α = 0.5": [(mode, "alpha0.5") for mode in MODES],
         "the same without penalty": [(mode, "penalty0_alpha0.5") for mode in MODES],
         "human": [("demonstrations", "human")],
@@ -255,21 +261,23 @@ def habits(episodes: list[dict[str, np.ndarray]], track) -> dict[str, float]:
     }
 
 
-def drivers(folder: Path, most: int) -> dict[str, list[list[dict[str, np.ndarray]]]]:
+def drivers(folder: Path, expert: int, most: int) -> dict[str, list[list[dict[str, np.ndarray]]]]:
     """Demonstrations of each driver, a list for each finished run that has some."""
     found = {name: [] for name in EXPERTS.values()}
     for run in sorted(folder.glob("*_seed*")):
-        kind = run.name.rsplit("_seed", 1)[0]
+        kind, seed = run.name.rsplit("_seed", 1)
+        if kind == "expert" and int(seed) != expert:
+            continue
         if kind == "human" or (run / "result.json").exists():
             episodes = read_episodes(run if kind == "human" else run / "demos", most)
             found.setdefault(EXPERTS.get(kind, kind), []).extend([episodes] if episodes else [])
     return {name: seeds for name, seeds in found.items() if seeds}
 
 
-def habit_tables(folder: Path, most: int) -> str:
+def habit_tables(folder: Path, expert: int, most: int) -> str:
     """How each driver drives; and on which side of each parked car."""
     track = gail.Track(*gail.TRACKS["meadow"])
-    measured = {name: [habits(part, track) for part in seeds] for name, seeds in drivers(folder, most).items()}
+    measured = {name: [habits(part, track) for part in seeds] for name, seeds in drivers(folder, expert, most).items()}
     columns = {
         "speed": "km/h",
         "into curves": "into curves, km/h",
@@ -297,10 +305,10 @@ def provenance(rows: list[dict]) -> str:
     """What the results rest on."""
     own = [row for row in rows if row["mode"] in ("greedy", "evaluation")]
     hours = sum(row["training_seconds"] for row in own) / 3600
-    scripts = {"ddpg_torcs_like": "expert", "gail_hybrid": "alpha"}
+    scripts = {"ddpg_torcs_like": ("expert", "other"), "gail_hybrid": ("alpha",)}
     made_at = []
-    for script, part in scripts.items():
-        digests = {row["script_sha256"] for row in own if part in row["kind"]}
+    for script, parts in scripts.items():
+        digests = {row["script_sha256"] for row in own if any(part in row["kind"] for part in parts)}
         made_at.append(f"{script}.py at {', '.join(sorted(commit_of(script, digest) for digest in digests))}")
     seeds = ", ".join(map(str, sorted({row["seed"] for row in own})))
     return (
@@ -310,7 +318,7 @@ def provenance(rows: list[dict]) -> str:
 
 
 def main(args: Args) -> None:
-    rows = read_runs(args.runs)
+    rows = read_runs(args.runs, args.expert)
     if not rows:
         raise SystemExit(f"--runs {args.runs}: holds no finished run")
     args.out.mkdir(parents=True, exist_ok=True)
@@ -318,7 +326,7 @@ def main(args: Args) -> None:
     sections = {
         "Table 2.3": table_2_3(rows),
         "Fig. 2.8": alpha_table(rows),
-        "How they drive": habit_tables(args.runs, 20),
+        "How they drive": habit_tables(args.runs, args.expert, 20),
     }
     text = (
         provenance(rows)
