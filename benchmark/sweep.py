@@ -4,12 +4,13 @@
         --env-ids kle/Hopper-v2 kle/Walker2d-v2 --num-seeds 2 --grid update-epochs=4,10,20 \\
         --variants none kle-stop,d-target=0.03 --runs runs/my_sweep --workers 2
 
-`manifest.jsonl` in the folder of the runs has a line for each of them. Sent again, the sweep goes on with what is not
-done; a finished run is never run again. `--stop-at STEPS` ends all runs early on their full schedule, and a later sweep
-without it finishes them. `--slurm-template-path benchmark/slurm_template.sh` submits arrays instead, `--workers` tasks at
-a time.
+`{name}.jsonl` in the folder of the runs, the manifest, has a line for each of them. Sent again, the sweep goes on with what
+is not done; a finished run is never run again, also where another sweep in the same folder has finished it. `--stop-at
+STEPS` ends all runs early on their full schedule, and a later sweep without it finishes them. `--slurm-template-path
+benchmark/slurm_template.sh` submits arrays instead, of which `--workers` tasks run at a time.
 
-The command needs `--env-id`, `--seed`, `--run-dir` and `--resume`, and a `result.json` at its end, as all scripts here.
+The command must understand `--env-id`, `--seed`, `--run-dir`, `--resume` and `--stop-at`, and write a `result.json` at its
+end, as all scripts here do.
 """
 
 import fcntl
@@ -23,7 +24,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -33,7 +35,7 @@ import tyro
 @dataclass
 class Args:
     command: str = ""
-    """what each run starts with: interpreter, script and the flags that all runs share"""
+    """what each run starts with, in quotes: interpreter, script and the flags that all runs share"""
     env_ids: tuple[str, ...] = ()
     """environments"""
     num_seeds: int = 3
@@ -46,6 +48,8 @@ class Args:
     """FLAG,FLAG=VALUE,...: a run with each of these sets of flags; none is the empty one"""
     runs: Path = Path("runs/sweep")
     """folder for the manifest, the runs' folders and logs"""
+    name: str = "sweep"
+    """name of the manifest; several sweeps may share a folder, and the runs that they have in common"""
     workers: int = 1
     """runs at a time"""
     stop_at: int | None = None
@@ -64,6 +68,14 @@ class UsageError(Exception):
     """A user's mistake, told in one line; the exit code is 2."""
 
 
+def require(holds: bool, complaint: str) -> None:
+    if not holds:
+        raise UsageError(complaint)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The manifest
+# ---------------------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class Run:
     """A line of the manifest."""
@@ -74,30 +86,32 @@ class Run:
     def line(self) -> str:
         return json.dumps({"name": self.name, "command": self.command})
 
+    def setting(self) -> str:
+        """What runs that take about as long have in common: all of the name but environment and seed."""
+        return "__".join(self.name.split("__")[1:-1])
 
-# ---------------------------------------------------------------------------------------------------------------------
-# The manifest
-# ---------------------------------------------------------------------------------------------------------------------
+
 def parse_grid(entries: tuple[str, ...]) -> list[list[tuple[str, str]]]:
     """`FLAG=VALUE,VALUE` -> for each entry its (flag, value) pairs. Raises UsageError."""
-    axes = []
+    axes: dict[str, list[tuple[str, str]]] = {}
     for entry in entries:
-        flag, equals, values = entry.partition("=")
+        flag, _, values = entry.partition("=")
         flag = flag.removeprefix("--").replace("_", "-")
-        if not (flag and equals and all(values.split(","))):
-            raise UsageError(f"--grid {entry}: must be FLAG=VALUE,VALUE,...")
-        if flag in [axis[0][0] for axis in axes]:
-            raise UsageError(f"--grid {entry}: the flag is there twice")
-        axes.append([(flag, value) for value in values.split(",")])
-    return axes
+        require(bool(flag) and all(values.split(",")), f"--grid {entry}: must be FLAG=VALUE,VALUE,...")
+        require(flag not in axes, f"--grid {entry}: the flag is there twice")
+        axes[flag] = [(flag, value) for value in values.split(",")]
+    return list(axes.values())
 
 
 def parse_variant(text: str) -> list[str]:
-    """`FLAG,FLAG=VALUE` -> words of a command line; none of `none`."""
+    """`FLAG,FLAG=VALUE` -> words of a command line; no word of `none`. Raises UsageError."""
     words = []
     for part in [] if text == "none" else text.split(","):
         flag, equals, value = part.partition("=")
-        words += [f"--{flag.removeprefix('--')}", *([value] if equals else [])]
+        flag = flag.removeprefix("--").replace("_", "-")
+        holds = bool(flag) and bool(value) == bool(equals)
+        require(holds, f"--variants {text}: must be FLAG,FLAG=VALUE,... or none")
+        words += [f"--{flag}", *([value] if equals else [])]
     return words
 
 
@@ -108,67 +122,59 @@ def slug(text: str) -> str:
 
 def make_runs(args: Args) -> list[Run]:
     """All runs, seeds outermost: whatever part is done has every setting. Raises UsageError."""
-    command = shlex.split(args.command)
-    for holds, complaint in (
-        (command, "--command: give interpreter, script and the flags that all runs share, in quotes"),
-        (args.env_ids, "--env-ids: name at least one environment"),
-        (args.num_seeds >= 1, f"--num-seeds {args.num_seeds}: must be at least 1"),
-        (args.start_seed >= 0, f"--start-seed {args.start_seed}: must be at least 0"),
-        (args.workers >= 1, f"--workers {args.workers}: must be at least 1"),
-        (args.retries >= 0, f"--retries {args.retries}: must be at least 0"),
-        (args.slurm_chunk >= 1, f"--slurm-chunk {args.slurm_chunk}: must be at least 1"),
-    ):
-        if not holds:
-            raise UsageError(complaint)
-    runs = []
+    command, axes = shlex.split(args.command), parse_grid(args.grid)
+    require(bool(command), "--command: give interpreter, script and the flags that all runs share, in quotes")
+    require(bool(args.env_ids), "--env-ids: name at least one environment")
+    require(slug(args.name) == args.name, f"--name {args.name}: must be letters, digits and any of . = -")
+    for name, least in (("num_seeds", 1), ("start_seed", 0), ("workers", 1), ("retries", 0), ("slurm_chunk", 1)):
+        value = getattr(args, name)
+        require(value >= least, f"--{name.replace('_', '-')} {value}: must be at least {least}")
+    require(args.stop_at is None or args.stop_at >= 1, f"--stop-at {args.stop_at}: must be at least 1")
     seeds = range(args.start_seed, args.start_seed + args.num_seeds)
-    axes = parse_grid(args.grid)
+    runs = []
     for seed, variant, values, env_id in itertools.product(
         seeds, args.variants, itertools.product(*axes), args.env_ids
     ):
+        setting = ["" if variant == "none" else variant, *(f"{flag}={value}" for flag, value in values)]
+        name = "__".join(slug(part) for part in (env_id, *setting, f"seed{seed}") if part)
         flags = [word for flag, value in values for word in (f"--{flag}", value)] + parse_variant(variant)
-        parts = [
-            env_id,
-            "" if variant == "none" else variant,
-            *(f"{flag}={value}" for flag, value in values),
-            f"seed{seed}",
-        ]
-        name = "__".join(slug(part) for part in parts if part)
-        whole = [*command, "--env-id", env_id, "--seed", str(seed), *flags]
-        runs.append(Run(name, (*whole, "--run-dir", str(args.runs / name), "--resume")))
-    names = [run.name for run in runs]
-    twice = next((name for name in names if names.count(name) > 1), None) if len(set(names)) < len(names) else None
-    if twice:
-        raise UsageError(f"--grid, --variants: two runs would have the folder {twice}")
+        words = [*command, "--env-id", env_id, "--seed", str(seed), *flags]
+        runs.append(Run(name, (*words, "--run-dir", str(args.runs / name), "--resume")))
+    name, number = Counter(run.name for run in runs).most_common(1)[0]
+    require(number == 1, f"--env-ids, --grid, --variants: {number} runs would have the folder {name}")
     return runs
+
+
+def manifest_path(args: Args) -> Path:
+    return args.runs / f"{args.name}.jsonl"
+
+
+def read_manifest(path: Path) -> list[Run]:
+    """The runs of a sweep. Raises UsageError where there is no manifest."""
+    try:
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        return [Run(row["name"], tuple(row["command"])) for row in rows]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path}: no readable manifest: {error}") from None
 
 
 def open_manifest(args: Args, runs: list[Run]) -> None:
     """Write the manifest, or see that it is the one that is there. Raises UsageError where it is another."""
-    path = args.runs / "manifest.jsonl"
-    lines = [run.line() for run in runs]
+    path, ours = manifest_path(args), {run.name: run.command for run in runs}
     if path.exists():
-        old = path.read_text().splitlines()
-        if old != lines:
-            at = next((i for i, (a, b) in enumerate(zip(old, lines)) if a != b), min(len(old), len(lines)))
-            raise UsageError(
-                f"--runs {args.runs}: holds another sweep, of {len(old)} runs for {len(lines)}, from run {at + 1} on; "
-                "give another folder"
-            )
+        old = read_manifest(path)
+        at = next((i for i, (a, b) in enumerate(zip(old, runs)) if a != b), min(len(old), len(runs)))
+        differs = f"{path}: is of another sweep, from run {at + 1} of {len(old)} on; give another --name or --runs"
+        require(old == runs, differs)
         return
+    for other in sorted(args.runs.glob("*.jsonl")):
+        for run in read_manifest(other):
+            same = ours.get(run.name, run.command) == run.command
+            require(same, f"{other}: has another command for {run.name}; give another --runs")
     args.runs.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".tmp")
-    draft.write_text("".join(line + "\n" for line in lines))
+    draft.write_text("".join(run.line() + "\n" for run in runs))
     draft.replace(path)
-
-
-def read_manifest(folder: Path) -> list[Run]:
-    """The runs of a sweep. Raises UsageError where there is no manifest."""
-    try:
-        rows = [json.loads(line) for line in (folder / "manifest.jsonl").read_text().splitlines()]
-        return [Run(row["name"], tuple(row["command"])) for row in rows]
-    except (OSError, ValueError, KeyError) as error:
-        raise UsageError(f"--runs {folder}: no readable manifest.jsonl: {error}") from None
 
 
 def read_result(folder: Path) -> dict | None:
@@ -179,9 +185,8 @@ def read_result(folder: Path) -> dict | None:
         return None
 
 
-def is_done(folder: Path, stop_at: int | None) -> bool:
+def is_done(result: dict | None, stop_at: int | None) -> bool:
     """Whether a run has come to the end of its schedule, or to `stop_at`."""
-    result = read_result(folder)
     return result is not None and (result["complete"] or stop_at is not None and result["global_step"] >= stop_at)
 
 
@@ -189,6 +194,7 @@ def is_done(folder: Path, stop_at: int | None) -> bool:
 # On this machine
 # ---------------------------------------------------------------------------------------------------------------------
 BUSY = "another process is running in it"  # a run that an earlier, killed sweep has left behind
+BUSY_WAIT = 5.0  # s until it is tried again
 THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS")}
 
 
@@ -196,14 +202,36 @@ THREADS = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "MKL", "OPENBLAS")}
 class Sweep:
     """What is where; changed by the workers under `lock`."""
 
-    waiting: deque[Run]
-    running: dict[Run, subprocess.Popen] = field(default_factory=dict)
-    done: list[Run] = field(default_factory=list)
+    waiting: deque[Run] = field(default_factory=deque)
+    running: dict[Run, tuple[subprocess.Popen, float]] = field(default_factory=dict)  # with the time of the start
+    done: int = 0
     failed: dict[Run, int] = field(default_factory=dict)  # with the exit code
-    attempts: dict[Run, int] = field(default_factory=dict)
-    seconds: list[float] = field(default_factory=list)  # of the runs that ended here
+    failures: Counter[Run] = field(default_factory=Counter)
+    seconds: dict[str, list[float]] = field(default_factory=dict)  # of training, by setting
+    has_finished_one: bool = False  # since it was started
     stopped: str = ""  # why nothing more is started
     lock: threading.Lock = field(default_factory=threading.Lock)
+
+
+def begin_sweep(args: Args, runs: list[Run]) -> Sweep:
+    """A sweep with what is done and what is not."""
+    sweep = Sweep()
+    for run in runs:
+        result = read_result(args.runs / run.name)
+        if is_done(result, args.stop_at):
+            count_done(sweep, run, result)
+        else:
+            sweep.waiting.append(run)
+    return sweep
+
+
+def count_done(sweep: Sweep, run: Run, result: dict) -> None:
+    sweep.done += 1
+    sweep.seconds.setdefault(run.setting(), []).append(result["training_seconds"])
+
+
+def command_of(args: Args, run: Run) -> list[str]:
+    return [*run.command, *(["--stop-at", str(args.stop_at)] if args.stop_at is not None else [])]
 
 
 def log_path(args: Args, run: Run) -> Path:
@@ -214,36 +242,42 @@ def log_end(args: Args, run: Run, lines: int = 15) -> str:
     """The last lines that a run printed."""
     try:
         return "\n".join(
-            "    " + line for line in log_path(args, run).read_text(errors="replace").splitlines()[-lines:]
+            f"    {line}" for line in log_path(args, run).read_text(errors="replace").splitlines()[-lines:]
         )
     except OSError as error:
         return f"    {error}"
 
 
 def start(args: Args, run: Run) -> subprocess.Popen:
-    """Start a run in a process group of its own, so that Ctrl-C reaches it by this script alone."""
-    command = [*run.command, *(["--stop-at", str(args.stop_at)] if args.stop_at is not None else [])]
+    """Start a run in a session of its own, so that Ctrl-C reaches it by this script alone."""
     with open(log_path(args, run), "ab") as log:
-        log.write(f"$ {shlex.join(command)}\n".encode())
+        log.write(f"$ {shlex.join(command_of(args, run))}\n".encode())
         log.flush()
         environment = {**os.environ, **THREADS}
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True)
+        streams = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": subprocess.STDOUT}
+        return subprocess.Popen(command_of(args, run), **streams, env=environment, start_new_session=True)
 
 
-def settle(args: Args, sweep: Sweep, run: Run, code: int, seconds: float) -> None:
-    """Put a run whose process has ended where it belongs."""
-    sweep.running.pop(run)
-    if code == 0 and is_done(args.runs / run.name, args.stop_at):
-        sweep.done.append(run)
-        sweep.seconds.append(seconds)
-    elif sweep.stopped:
-        sweep.waiting.appendleft(run)
-    elif code == 2 and BUSY in log_end(args, run, 1) or sweep.attempts[run] <= args.retries and code != 2:
+def settle(args: Args, sweep: Sweep, run: Run, code: int) -> bool:
+    """Put a run whose process has ended where it belongs. Returns whether it was found busy."""
+    del sweep.running[run]
+    result = read_result(args.runs / run.name)
+    is_busy = code == 2 and BUSY in log_end(args, run, 1)
+    if code == 0 and is_done(result, args.stop_at):
+        count_done(sweep, run, result)
+        sweep.has_finished_one = True
+        return False
+    if is_busy or sweep.stopped:
         sweep.waiting.append(run)
-    else:
-        sweep.failed[run] = code
-        if not sweep.done:
-            sweep.stopped = "the first run failed"
+        return is_busy
+    sweep.failures[run] += 1
+    if code != 2 and sweep.failures[run] <= args.retries:
+        sweep.waiting.append(run)
+        return False
+    sweep.failed[run] = code
+    if not sweep.has_finished_one:
+        sweep.stopped = "the first run failed, so nothing more was started"
+    return False
 
 
 def work(args: Args, sweep: Sweep) -> None:
@@ -257,124 +291,172 @@ def work(args: Args, sweep: Sweep) -> None:
                 process = start(args, run)
             except OSError as error:
                 sweep.waiting.appendleft(run)
-                sweep.stopped = str(error)
+                sweep.stopped = f"{run.name} could not be started: {error}"
                 return
-            sweep.running[run] = process
-            sweep.attempts[run] = sweep.attempts.get(run, 0) + 1
-            began = time.monotonic()
+            sweep.running[run] = process, time.monotonic()
         code = process.wait()
         with sweep.lock:
-            settle(args, sweep, run, code, time.monotonic() - began)
-            is_busy = code == 2 and run in sweep.waiting
+            is_busy = settle(args, sweep, run, code)
         if is_busy:
-            time.sleep(5)
+            time.sleep(BUSY_WAIT)
 
 
-def status_line(sweep: Sweep, workers: int) -> str:
-    """Numbers of runs, and the core-hours that are left by the mean of those that ended here."""
-    left = len(sweep.waiting) + len(sweep.running)
-    mean = sum(sweep.seconds) / len(sweep.seconds) if sweep.seconds else None
-    hours = "" if mean is None else f", about {left * mean / 3600:.1f} core-hours left"
-    numbers = f"{len(sweep.done)} done, {len(sweep.running)} running, {len(sweep.waiting)} waiting"
-    return f"{numbers}, {len(sweep.failed)} failed{hours}"
+def core_hours_left(sweep: Sweep) -> float | None:
+    """Mean training time of the same settings for each run that is left, of all where none is done; None at the start."""
+    if not sweep.done:
+        return None
+    means = {setting: sum(seconds) / len(seconds) for setting, seconds in sweep.seconds.items()}
+    overall = sum(means.values()) / len(means)
+    left = [means.get(run.setting(), overall) for run in (*sweep.waiting, *sweep.running)]
+    return sum(left) / 3600
 
 
-def checkpoint_all(sweep: Sweep, reason: str) -> None:
-    """Start nothing more, and let every run write a checkpoint and end."""
+def status_line(sweep: Sweep) -> str:
+    """Numbers of runs, and what is left to do."""
+    hours = core_hours_left(sweep)
+    left = "" if hours is None else f"; about {hours:.1f} core-hours left"
+    numbers = f"{sweep.done} done, {len(sweep.running)} running, {len(sweep.waiting)} waiting"
+    return f"{numbers}, {len(sweep.failed)} failed{left}"
+
+
+def live_table(sweep: Sweep) -> list[str]:
+    """The status, and a line for each run that is running."""
+    now = time.monotonic()
+    return [status_line(sweep), *(f"  {now - began:6.0f} s  {run.name}" for run, (_, began) in sweep.running.items())]
+
+
+def show(sweep: Sweep, shown: list[str]) -> list[str]:
+    """Draw the table over the one before on a terminal; elsewhere print the status where it has changed."""
     with sweep.lock:
-        sweep.stopped = reason
-        for process in sweep.running.values():
-            process.send_signal(signal.SIGTERM)
+        lines = live_table(sweep)
+    if sys.stdout.isatty():
+        up = f"\033[{len(shown)}F" if shown else ""
+        print(f"{up}\033[J" + "\n".join(lines), flush=True)
+    elif lines[0] != (shown or [""])[0]:
+        print(lines[0], flush=True)
+    return lines
+
+
+def signal_all(sweep: Sweep, number: int) -> None:
+    with sweep.lock:
+        for process, _ in sweep.running.values():
+            process.send_signal(number)
+
+
+@dataclass
+class Signals:
+    """Ctrl-C and SIGTERM as they come: the first lets all runs write a checkpoint, the second kills them."""
+
+    received: list[int] = field(default_factory=list)
+    obeyed: int = 0
+
+    def install(self) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, frame: self.received.append(number))
+
+    def obey(self, sweep: Sweep) -> None:
+        """Pass on what has come since."""
+        for number in self.received[self.obeyed :]:
+            sweep.stopped = f"stopped by signal {number}"
+            signal_all(sweep, signal.SIGTERM if self.obeyed == 0 else signal.SIGKILL)
+            self.obeyed += 1
 
 
 def run_here(args: Args, runs: list[Run]) -> int:
     """Run what is not done with a pool of workers. Returns the exit code."""
     (args.runs / "logs").mkdir(exist_ok=True)
-    lock = os.open(args.runs, os.O_RDONLY)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        raise UsageError(f"--runs {args.runs}: another sweep is running in it") from None
-    sweep = Sweep(deque())
-    for run in runs:
-        (sweep.done if is_done(args.runs / run.name, args.stop_at) else sweep.waiting).append(run)
-    signals = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: signals.append(number))
-    workers = [threading.Thread(target=work, args=(args, sweep), daemon=True) for _ in range(args.workers)]
-    for worker in workers:
-        worker.start()
-    shown, is_terminal = "", sys.stdout.isatty()
-    while any(worker.is_alive() for worker in workers):
-        if signals and not sweep.stopped:
-            checkpoint_all(sweep, f"stopped by signal {signals[0]}")
-        line = status_line(sweep, args.workers)
-        if line != shown:
-            print(f"\r\033[K{line}" if is_terminal else line, end="" if is_terminal else "\n", flush=True)
-            shown = line
-        time.sleep(0.2)
-    if is_terminal:
-        print()
+    with open(manifest_path(args)) as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise UsageError(f"{manifest_path(args)}: this sweep is running") from None
+        signals = Signals()
+        signals.install()
+        sweep = begin_sweep(args, runs)
+        workers = [threading.Thread(target=work, args=(args, sweep), daemon=True) for _ in range(args.workers)]
+        for worker in workers:
+            worker.start()
+        shown: list[str] = []
+        while any(worker.is_alive() for worker in workers):
+            signals.obey(sweep)
+            shown = show(sweep, shown)
+            time.sleep(0.2)
+        show(sweep, shown)
     return report_end(args, sweep, signals)
 
 
-def report_end(args: Args, sweep: Sweep, signals: list[int]) -> int:
+def report_end(args: Args, sweep: Sweep, signals: Signals) -> int:
     """Say what failed and what is left. Returns the exit code."""
-    print(status_line(sweep, args.workers))
     for run, code in sweep.failed.items():
         print(f"failed: {run.name} (exit code {code}, {log_path(args, run)}):\n{log_end(args, run)}", file=sys.stderr)
-    if sweep.stopped:
+    if sweep.waiting:
         print(f"{sweep.stopped}; sent again, the sweep goes on", file=sys.stderr)
-    if signals:
-        return 128 + signals[0]
+    if signals.received:
+        return 128 + signals.received[0]
     return 1 if sweep.failed or sweep.waiting else 0
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # On Slurm
 # ---------------------------------------------------------------------------------------------------------------------
-def run_only(args: Args, runs: list[Run]) -> int:
+def run_only(args: Args) -> int:
     """Become the process of one line of the manifest, unless it is done: signals reach it as they come."""
-    if not 0 <= args.only < len(runs):
-        raise UsageError(f"--only {args.only}: the manifest has lines 0 to {len(runs) - 1}")
+    runs = read_manifest(manifest_path(args))
+    require(0 <= args.only < len(runs), f"--only {args.only}: the manifest has lines 0 to {len(runs) - 1}")
     run = runs[args.only]
-    if is_done(args.runs / run.name, args.stop_at):
+    if is_done(read_result(args.runs / run.name), args.stop_at):
         print(f"{run.name} is done")
         return 0
-    command = [*run.command, *(["--stop-at", str(args.stop_at)] if args.stop_at is not None else [])]
     os.environ.update(THREADS)
+    command = command_of(args, run)
     os.execvp(command[0], command)
 
 
+def slurm(*words: str) -> str:
+    """What a command of Slurm prints. Raises UsageError where it fails or is not installed."""
+    try:
+        done = subprocess.run(words, capture_output=True, text=True)
+    except FileNotFoundError:
+        raise UsageError(f"--slurm-template-path: {words[0]} is not installed here") from None
+    require(done.returncode == 0, f"{shlex.join(words)} failed: {done.stderr.strip()}")
+    return done.stdout.strip()
+
+
 def fill(template: str, values: dict[str, str]) -> str:
-    """The template with its {{names}} filled in."""
+    """The template with its {{names}} filled in. Raises UsageError for a name that is not there."""
+    for name in re.findall(r"\{\{(\w+)\}\}", template):
+        require(name in values, f"--slurm-template-path: {{{{{name}}}}} must be one of {', '.join(values)}")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
 
 
+def chunks(items: list[int], size: int) -> Iterator[list[int]]:
+    for begin in range(0, len(items), size):
+        yield items[begin : begin + size]
+
+
 def submit(args: Args, runs: list[Run]) -> int:
-    """Submit what is not done as arrays of at most `--slurm-chunk` tasks."""
-    left = [i for i, run in enumerate(runs) if not is_done(args.runs / run.name, args.stop_at)]
+    """Submit what is not done as arrays of at most `--slurm-chunk` tasks. Raises UsageError."""
+    job_name = f"{args.runs.name}-{args.name}"
+    queued = slurm("squeue", "--noheader", "--format=%A", f"--name={job_name}")
+    require(not queued, f"--name {args.name}: jobs of this sweep are still queued, squeue --name={job_name}")
+    left = [i for i, run in enumerate(runs) if not is_done(read_result(args.runs / run.name), args.stop_at)]
     template = args.slurm_template_path.read_text()
-    (args.runs / "slurm").mkdir(exist_ok=True)
-    (args.runs / "logs").mkdir(exist_ok=True)
-    for number, begin in enumerate(range(0, len(left), args.slurm_chunk)):
-        lines = left[begin : begin + args.slurm_chunk]
-        flags = [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
-        one = [sys.executable, str(Path(__file__).resolve()), "--runs", str(args.runs), *flags, "--only"]
+    for folder in ("slurm", "logs"):
+        (args.runs / folder).mkdir(exist_ok=True)
+    one = [sys.executable, str(Path(__file__).resolve()), "--runs", str(args.runs), "--name", args.name]
+    one += [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
+    for number, lines in enumerate(chunks(left, args.slurm_chunk)):
         values = {
+            "name": job_name,
             "array": f"0-{len(lines) - 1}%{args.workers}",
             "lines": " ".join(map(str, lines)),
-            "logs": str(args.runs / "logs"),
-            "name": args.runs.name,
-            "command": shlex.join(one),
+            "logs": str((args.runs / "logs").resolve()),
+            "retries": str(args.retries),
+            "command": shlex.join([*one, "--only"]),
         }
-        script = args.runs / "slurm" / f"array_{number}.sh"
+        script = args.runs / "slurm" / f"{args.name}_{number}.sh"
         script.write_text(fill(template, values))
-        done = subprocess.run(["sbatch", "--parsable", str(script)], capture_output=True, text=True)
-        if done.returncode:
-            print(f"sbatch {script} failed: {done.stderr.strip()}", file=sys.stderr)
-            return 1
-        print(f"{len(lines)} runs in job {done.stdout.strip()} ({script})")
+        print(f"{len(lines)} runs in job {slurm('sbatch', '--parsable', str(script))} ({script})")
     if not left:
         print(f"all {len(runs)} runs are done")
     return 0
@@ -382,12 +464,12 @@ def submit(args: Args, runs: list[Run]) -> int:
 
 def main(args: Args) -> int:
     if args.only is not None:
-        return run_only(args, read_manifest(args.runs))
+        return run_only(args)
     runs = make_runs(args)
-    if args.slurm_template_path is not None and not args.slurm_template_path.is_file():
-        raise UsageError(f"--slurm-template-path {args.slurm_template_path}: no such file")
+    template = args.slurm_template_path
+    require(template is None or template.is_file(), f"--slurm-template-path {template}: no such file")
     open_manifest(args, runs)
-    return submit(args, runs) if args.slurm_template_path is not None else run_here(args, runs)
+    return run_here(args, runs) if template is None else submit(args, runs)
 
 
 def cli() -> int:

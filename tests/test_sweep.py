@@ -1,0 +1,245 @@
+"""benchmark/sweep.py with runs that last milliseconds; on a real Slurm in test_slurm.py."""
+
+import fcntl
+import importlib
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+
+sys.path.insert(0, str(ROOT / "benchmark"))
+sweep = importlib.import_module("sweep")
+
+SCRIPT, TOY = ROOT / "benchmark" / "sweep.py", ROOT / "tests" / "data" / "toy_run.py"
+COMMAND = ["--command", f"{sys.executable} -I {TOY}", "--runs", "runs"]
+SMALL = [*COMMAND, "--env-ids", "A-v0", "B-v0", "--num-seeds", "2", "--grid", "bonus=0,5", "--workers", "2"]
+
+
+def start(flags: list, folder: Path) -> subprocess.Popen:
+    command = [sys.executable, str(SCRIPT), *map(str, flags)]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def run(flags: list, folder: Path, code: int = 0) -> tuple[str, str]:
+    process = start(flags, folder)
+    out, err = process.communicate(timeout=100)
+    assert process.returncode == code, out + err
+    return out, err
+
+
+def records(folder: Path) -> dict[str, str]:
+    return {path.parent.name: path.read_text() for path in sorted(folder.glob("runs/*/steps.txt"))}
+
+
+def ends(folder: Path) -> list[int]:
+    """How often each run came to its end."""
+    return [path.read_text().count("\n") for path in sorted(folder.glob("runs/*/ends.txt"))]
+
+
+# The manifest
+def test_runs_are_the_product_of_environments_variants_grid_and_seeds():
+    args = sweep.Args(command="python x.py --compile", env_ids=("kle/A-v2", "B"), num_seeds=2, start_seed=3)
+    args.grid, args.variants = ("update_epochs=4,10", "--lr=1e-3"), ("none", "kle-stop,d_target=0.03")
+    runs = sweep.make_runs(args)
+    assert len(runs) == len({run.name for run in runs}) == 2 * 2 * 2 * 2
+    assert [run.name.split("__")[-1] for run in runs] == ["seed3"] * 8 + ["seed4"] * 8
+    last = runs[-1]
+    assert last.name == "B__kle-stop_d_target=0.03__update-epochs=10__lr=1e-3__seed4"
+    words = "python x.py --compile --env-id B --seed 4 --update-epochs 10 --lr 1e-3 --kle-stop --d-target 0.03"
+    assert " ".join(last.command) == f"{words} --run-dir runs/sweep/{last.name} --resume"
+    assert runs[0].name == "kle_A-v2__update-epochs=4__lr=1e-3__seed3" and runs[0].setting() == runs[1].setting()
+
+
+def test_another_manifest_of_the_same_name_is_refused(tmp_path):
+    run(SMALL, tmp_path)
+    before = (tmp_path / "runs" / "sweep.jsonl").read_bytes()
+    _, err = run([*SMALL, "--num-seeds", "3"], tmp_path, code=2)
+    assert "runs/sweep.jsonl" in err and "from run 9 of 8 on" in err and err.count("\n") == 1
+    _, err = run([*SMALL, "--name", "other", "--variants", "double"], tmp_path)
+    _, err = run([*SMALL, "--name", "third", "--command", f"{COMMAND[1]} --total 9"], tmp_path, code=2)
+    assert "has another command for A-v0__bonus=0__seed1" in err
+    assert (tmp_path / "runs" / "sweep.jsonl").read_bytes() == before
+    assert not (tmp_path / "runs" / "third.jsonl").exists()
+
+
+def test_sweeps_in_one_folder_share_their_runs(tmp_path):
+    run(SMALL, tmp_path)
+    out, _ = run([*SMALL, "--name", "more", "--num-seeds", "3"], tmp_path)
+    assert out.splitlines()[0].startswith("8 done") and out.splitlines()[-1].startswith("12 done, 0 running")
+    assert ends(tmp_path) == [1] * 12
+
+
+# The pool
+def test_a_sweep_runs_everything_once(tmp_path):
+    out, _ = run(SMALL, tmp_path)
+    assert out.splitlines()[-1] == "8 done, 0 running, 0 waiting, 0 failed; about 0.0 core-hours left"
+    whole = records(tmp_path)
+    assert len(whole) == 8 and all(text.count("\n") == 20 for text in whole.values())
+    assert whole["B-v0__bonus=5__seed2"].startswith("1 6\n2 7\n")
+    out, _ = run(SMALL, tmp_path)
+    assert out.count("\n") == 1 and out.startswith("8 done")
+    assert records(tmp_path) == whole and ends(tmp_path) == [1] * 8
+
+
+def test_runs_that_ended_early_are_finished_later(tmp_path):
+    run([*SMALL, "--stop-at", 7], tmp_path)
+    assert {text.count("\n") for text in records(tmp_path).values()} == {7}
+    run([*SMALL, "--stop-at", 5], tmp_path)
+    assert ends(tmp_path) == [1] * 8
+    run(SMALL, tmp_path)
+    assert {text.count("\n") for text in records(tmp_path).values()} == {20} and ends(tmp_path) == [2] * 8
+
+
+def test_a_run_that_crashes_is_started_again(tmp_path):
+    flags = [*SMALL, "--variants", "crash-at=9", "--grid", "bonus=0"]
+    out, _ = run(flags, tmp_path)
+    assert out.splitlines()[-1].startswith("4 done") and {t.count("\n") for t in records(tmp_path).values()} == {20}
+    log = (tmp_path / "runs" / "logs" / "A-v0__crash-at=9__bonus=0__seed1.log").read_text()
+    assert log.count("$ ") == 2
+
+
+def test_failed_runs_are_listed_with_their_last_words(tmp_path):
+    """B-v0 passes once A-v0 has finished; a flag's wrong value is not tried again."""
+    flags = [*COMMAND, "--env-ids", "A-v0", "no/Such-v0", "--num-seeds", "2", "--grid", "bonus=0"]
+    _, err = run(flags, tmp_path, code=1)
+    assert err.count("failed: ") == 2 and "failed: no_Such-v0__bonus=0__seed1 (exit code 2, " in err
+    assert "invalid choice: 'no/Such-v0'" in err and ends(tmp_path) == [1, 1]
+
+
+@pytest.mark.parametrize("flags", [["--grid", "nonsense=1,2"], ["--command", "no_such_program"]])
+def test_a_command_that_cannot_work_is_told_after_the_first(flags, tmp_path):
+    out, err = run([*SMALL, "--num-seeds", "200", "--workers", "1", *flags], tmp_path, code=1)
+    assert ("no_such_program" if flags[0] == "--command" else "unrecognized arguments: --nonsense 1") in err
+    assert "sent again" in err and len(list((tmp_path / "runs" / "logs").iterdir())) == 1
+
+
+def test_ctrl_c_lets_runs_write_their_checkpoints(tmp_path):
+    flags = [*SMALL, "--command", f"{COMMAND[1]} --total 300"]
+    process = start(flags, tmp_path)
+    while len(records(tmp_path)) < 2:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=20)
+    assert process.returncode == 130 and "sent again, the sweep goes on" in err
+    before = records(tmp_path)
+    assert len(before) == 2 and all(text.count("\n") < 300 for text in before.values())
+    run(flags, tmp_path)
+    after = records(tmp_path)
+    assert all(after[name].startswith(text) for name, text in before.items()) and ends(tmp_path) == [1] * 8
+
+
+def test_two_sweeps_at_once_are_refused(tmp_path):
+    process = start([*SMALL, "--command", f"{COMMAND[1]} --total 300"], tmp_path)
+    while len(records(tmp_path)) < 2:
+        time.sleep(0.01)
+    _, err = run([*SMALL, "--command", f"{COMMAND[1]} --total 300"], tmp_path, code=2)
+    assert "this sweep is running" in err
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=20)
+
+
+def test_a_run_that_is_busy_is_waited_for(tmp_path, monkeypatch):
+    """An earlier sweep was killed and has left a process behind."""
+    flags = [*COMMAND, "--env-ids", "A-v0", "--num-seeds", "1", "--grid", "bonus=0", "--retries", "0"]
+    folder = tmp_path / "runs" / "A-v0__bonus=0__seed1"
+    folder.mkdir(parents=True)
+    lock = os.open(folder, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    process = start(flags, tmp_path)
+    log = tmp_path / "runs" / "logs" / f"{folder.name}.log"
+    while not (log.exists() and "another process" in log.read_text()):
+        time.sleep(0.05)
+    os.close(lock)
+    process.communicate(timeout=30)
+    assert process.returncode == 0 and ends(tmp_path) == [1]
+
+
+def test_random_kills_of_the_runner_and_of_its_workers_lose_nothing(tmp_path):
+    """SIGKILL at any moment, then sent again, until all is done: every run's steps are there once, and one end."""
+    flags = [*SMALL, "--num-seeds", "4", "--retries", "100"]
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    run(flags, whole)
+    rng, kills = random.Random(1), 0
+    process = start(flags, tmp_path)
+    while process.poll() is None or process.returncode != 0:
+        time.sleep(rng.uniform(0, 0.15))
+        if process.poll() is not None:
+            assert process.returncode in (0, -signal.SIGKILL)
+            process = start(flags, tmp_path)
+            continue
+        children = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
+        victim = process.pid if rng.random() < 0.3 or not children else int(rng.choice(children))
+        if kills < 20:
+            os.kill(victim, signal.SIGKILL)
+            kills += 1
+    assert kills >= 10
+    process.communicate()
+    assert records(tmp_path) == records(whole) and ends(tmp_path) == [1] * 16
+
+
+# What a user can get wrong
+@pytest.mark.parametrize(
+    "flags, words",
+    [
+        (["--command", ""], "--command: give"),
+        (["--env-ids"], "--env-ids"),
+        (["--grid", "bonus"], "--grid bonus: must be FLAG=VALUE"),
+        (["--grid", "bonus=1,,2"], "--grid bonus=1,,2: must be"),
+        (["--grid", "bonus=1", "bonus=2"], "--grid bonus=2: the flag is there twice"),
+        (["--grid", "bonus=1,1"], "2 runs would have the folder A-v0__bonus=1__seed1"),
+        (["--variants", "double,,x"], "--variants double,,x: must be"),
+        (["--num-seeds", "0"], "--num-seeds 0: must be at least 1"),
+        (["--workers", "0"], "--workers 0"),
+        (["--stop-at", "0"], "--stop-at 0"),
+        (["--name", "a b"], "--name a b"),
+        (["--slurm-template-path", "no/such"], "--slurm-template-path no/such: no such file"),
+        (["--only", "3"], "runs/sweep.jsonl: no readable manifest"),
+    ],
+)
+def test_bad_input_is_one_line_and_makes_nothing(flags, words, tmp_path):
+    _, err = run([*SMALL, *flags], tmp_path, code=2)
+    assert words in err and not list(tmp_path.iterdir())
+
+
+# Slurm's part that needs no Slurm
+def test_only_becomes_one_line_of_the_manifest(tmp_path):
+    run([*SMALL, "--num-seeds", "1"], tmp_path)
+    for path in tmp_path.glob("runs/*/*.*"):
+        if path.parent.name == "B-v0__bonus=0__seed1":
+            path.unlink()
+    out, _ = run(["--runs", "runs", "--only", "0"], tmp_path)
+    assert out == "A-v0__bonus=0__seed1 is done\n"
+    run(["--runs", "runs", "--only", "1"], tmp_path)
+    assert ends(tmp_path) == [1] * 4
+    _, err = run(["--runs", "runs", "--only", "4"], tmp_path, code=2)
+    assert "--only 4: the manifest has lines 0 to 3" in err
+
+
+def test_arrays_are_submitted_in_chunks_of_what_is_not_done(tmp_path, monkeypatch):
+    """With stand-ins for squeue and sbatch, which keep what they are given."""
+    for name, body in (("squeue", ""), ("sbatch", 'cat "$2" >> submitted; echo 77')):
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{body}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    run([*SMALL, "--num-seeds", "1"], tmp_path)
+    flags = [*SMALL, "--name", "more", "--num-seeds", "3", "--slurm-chunk", "5", "--stop-at", "9", "--workers", "4"]
+    out, _ = run([*flags, "--slurm-template-path", ROOT / "benchmark" / "slurm_template.sh"], tmp_path)
+    assert re.findall(r"^(\d+) runs in job 77", out, re.M) == ["5", "3"]
+    text = (tmp_path / "submitted").read_text()
+    assert "{{" not in text and re.findall(r"--array=(\S+)", text) == ["0-4%4", "0-2%4"]
+    assert re.findall(r"^lines=\((.*)\)", text, re.M) == ["4 5 6 7 8", "9 10 11"]
+    assert "--runs runs --name more --stop-at 9 --only" in text
+    (tmp_path / "bin" / "squeue").write_text("#!/bin/sh\necho 77\n")
+    _, err = run([*flags, "--slurm-template-path", ROOT / "benchmark" / "slurm_template.sh"], tmp_path, code=2)
+    assert "still queued" in err
+    assert json.loads((tmp_path / "runs" / "more.jsonl").read_text().splitlines()[0])["name"] == "A-v0__bonus=0__seed1"
