@@ -1,0 +1,182 @@
+"""benchmark/sweep.py on a real Slurm of two nodes, started here on localhost."""
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import ROOT, SMALL, assert_same_run, command
+
+PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scontrol", "squeue")
+MISSING = [name for name in PROGRAMS if shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin") is None]
+pytestmark = [
+    pytest.mark.skipif(
+        bool(MISSING), reason=f"{', '.join(MISSING)} not installed: apt-get install slurmctld slurmd munge"
+    ),
+    pytest.mark.skipif(os.geteuid() != 0, reason="slurmd needs root to start jobs"),
+    pytest.mark.timeout(600),
+]
+CONFIGURATION = """
+ClusterName=test
+SlurmctldHost={host}(127.0.0.1)
+SlurmctldPort={ports[0]}
+SlurmUser=root
+SlurmdUser=root
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge.socket,cred_expire=5
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool_%n
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd_%n.pid
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdLogFile={folder}/slurmd_%n.log
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SwitchType=switch/none
+MpiDefault=none
+JobAcctGatherType=jobacct_gather/none
+AccountingStorageType=accounting_storage/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_Core
+SlurmdParameters=config_overrides
+ReturnToService=2
+SlurmdTimeout=5
+KillWait=2
+SchedulerParameters=batch_sched_delay=1,sched_interval=2
+NodeName=one NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[1]} CPUs=1 RealMemory=4000
+NodeName=two NodeHostname={host} NodeAddr=127.0.0.1 Port={ports[2]} CPUs=1 RealMemory=4000
+PartitionName=all Nodes=one,two Default=YES State=UP
+"""
+
+
+def free_ports(number: int) -> list[int]:
+    with contextlib.ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(number)]
+        for each in sockets:
+            each.bind(("127.0.0.1", 0))
+        return [each.getsockname()[1] for each in sockets]
+
+
+def wait_until(condition, seconds: float, what: str):
+    """What `condition` returns, once it is true."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.2)
+    raise AssertionError(f"{what}: not within {seconds} s")
+
+
+class Cluster:
+    """A controller and two nodes; `stop` ends them and all that they have started."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.daemons = folder, {}
+        self.environment = {**os.environ, "SLURM_CONF": str(folder / "slurm.conf")}
+        self.environment["PATH"] += ":/usr/sbin"
+        (folder / "state").mkdir()
+        text = CONFIGURATION.format(folder=folder, ports=free_ports(3), host=socket.gethostname().split(".")[0])
+        (folder / "slurm.conf").write_text(text)
+        key = folder / "munge.key"
+        key.write_bytes(os.urandom(128))
+        key.chmod(0o400)
+        files = {"key-file": key, "socket": folder / "munge.socket", "pid-file": folder / "munge.pid"}
+        files |= {"log-file": folder / "munge.log", "seed-file": folder / "munge.seed"}
+        self.start("munged", "--foreground", "--force", *(f"--{name}={path}" for name, path in files.items()))
+        wait_until((folder / "munge.socket").exists, 10, "munged")
+        self.start("slurmctld", "-D")
+        for node in ("one", "two"):
+            self.start_node(node)
+        wait_until(lambda: self.ask("sinfo", "--noheader", "--format=%T").split() == ["idle"], 60, "two idle nodes")
+
+    def start(self, *words: str, name: str = "") -> None:
+        with open(self.folder / "daemons.log", "ab") as log:
+            streams = {"stdout": log, "stderr": log, "start_new_session": True}
+            self.daemons[name or words[0]] = subprocess.Popen(words, env=self.environment, **streams)
+
+    def start_node(self, node: str) -> None:
+        self.start("slurmd", "-D", "-N", node, name=node)
+
+    def ask(self, *words: str) -> str:
+        return subprocess.run(words, env=self.environment, capture_output=True, text=True).stdout
+
+    def kill_node(self, node: str) -> None:
+        """As when its power goes: daemon, step managers and jobs at once."""
+        self.daemons.pop(node).kill()
+        for path in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                environment = (path / "environ").read_bytes().split(b"\0")
+                if f"SLURMD_NODENAME={node}".encode() in environment and self.is_own(environment):
+                    parent = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+                    is_step = Path(f"/proc/{parent}/comm").read_text().startswith("slurmstepd")
+                    os.kill(int(path.name), signal.SIGKILL)
+                    if is_step:
+                        os.kill(parent, signal.SIGKILL)
+
+    def is_own(self, environment: list[bytes]) -> bool:
+        return f"SLURM_CONF={self.folder / 'slurm.conf'}".encode() in environment
+
+    def stop(self) -> None:
+        self.ask("scancel", "--full", "--user=root")
+        for node in ("one", "two"):
+            if node in self.daemons:
+                self.kill_node(node)
+        for daemon in self.daemons.values():
+            daemon.kill()
+
+
+@pytest.fixture
+def cluster(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("slurm")
+    cluster = Cluster(folder)
+    try:
+        yield cluster
+    finally:
+        cluster.stop()
+
+
+def test_a_sweep_survives_the_death_of_a_node_and_a_preemption(cluster, tmp_path):
+    """Four runs on two nodes. One node dies, a task of the other gets Slurm's warning: all end as if undisturbed."""
+    flags = [*SMALL, "--total-timesteps", "40960", "--checkpoint-interval", "1024"]
+    whole = tmp_path / "whole"
+    for seed in (1, 2):
+        subprocess.run(command(*flags, "--seed", seed, "--run-dir", whole / str(seed)), check=True, capture_output=True)
+    script = ROOT / "cleanrl_thesis" / "ppo_continuous_kle.py"
+    (tmp_path / "runs" / "logs").mkdir(parents=True)
+    words = ["--command", f"{sys.executable} {script} {' '.join(flags[2:])}", "--env-ids", "Pendulum-v1"]
+    words += ["--num-seeds", "2", "--grid", "target-kl=1,2", "--workers", "4", "--runs", str(tmp_path / "runs")]
+    words += ["--slurm-template-path", str(ROOT / "benchmark" / "slurm_template.sh")]
+    sweep = [sys.executable, str(ROOT / "benchmark" / "sweep.py"), *words]
+    done = subprocess.run(sweep, env=cluster.environment, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.startswith("4 runs in job "), done.stdout + done.stderr
+    again = subprocess.run(sweep, env=cluster.environment, cwd=tmp_path, capture_output=True, text=True)
+    assert again.returncode == 2 and "still queued" in again.stderr
+
+    def begun() -> list[Path]:
+        """Runs with a checkpoint, not at their end."""
+        folders = [path.parent for path in (tmp_path / "runs").glob("*/checkpoint.pt")]
+        return [folder for folder in folders if not (folder / "result.json").exists()]
+
+    wait_until(lambda: len(begun()) >= 2, 120, "two runs with a checkpoint")
+    jobs = cluster.ask("squeue", "--noheader", "--states=R", "--array", "--format=%i %N").split("\n")
+    on_two = next(line.split()[0] for line in jobs if line.endswith(" two"))
+    cluster.kill_node("one")
+    cluster.ask("scancel", "--batch", "--signal=USR1", on_two)
+    wait_until(lambda: "down" in cluster.ask("sinfo", "--noheader", "--format=%T"), 60, "the dead node is found")
+    cluster.start_node("one")
+    wait_until(lambda: not cluster.ask("squeue", "--noheader"), 400, "an empty queue")
+
+    for folder in sorted((tmp_path / "runs").glob("*__seed*")):
+        assert_same_run(whole / folder.name[-1], folder)
+    assert len(list((tmp_path / "runs").glob("*__seed*/result.json"))) == 4
+    logs = "\n".join(path.read_text() for path in (tmp_path / "runs" / "logs").glob("slurm_*.log"))
+    assert logs.count("stopped by signal 10") == 1, logs
+    log = (cluster.folder / "slurmctld.log").read_text()
+    assert log.count("Requeu") + log.count("requeue") >= 2, log
