@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# The study of chapter 4: 11 tasks × K {4, 10, 20, 40, 80} × {plain, KLE-Stop and KLE-Rollback at five d_target} × 2 seeds,
+# 1,210 runs. Can be sent again after every stop; stages share their runs.
+#   benchmark/ppo_kle.sh                                                         all 1,210, 2,000,000 steps each
+#   STAGES="first targets seeds" STOP_AT=500000 benchmark/ppo_kle.sh             the 384 runs of benchmark/results/ppo_kle
+#   WORKERS=200 SLURM=benchmark/slurm_template.sh benchmark/ppo_kle.sh           on a cluster, 200 runs at a time
+set -euo pipefail
+cd "$(dirname "$0")/.."
+STAGES=${STAGES:-all} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/ppo_kle}
+SIX=(kle/{HalfCheetah,Hopper,Walker2d,Swimmer,Reacher,InvertedPendulum}-v2)
+FIVE=(kle/{Ant,Humanoid,Pusher,Striker,Thrower}-v2)
+sweep() {  # name of the stage, then what differs
+  "$PYTHON" benchmark/sweep.py --command "$PYTHON cleanrl_thesis/ppo_continuous_kle.py --compile --checkpoint-interval 200000" \
+    --runs "$RUNS" --workers "$WORKERS" ${STOP_AT:+--stop-at "$STOP_AT"} ${SLURM:+--slurm-template-path "$SLURM"} --name "$@"
+}
+both() { for target in "$@"; do echo "kle-stop,d-target=$target" "kle-rollback,d-target=$target"; done; }
+for stage in $STAGES; do
+  case $stage in
+    first) sweep first --env-ids "${SIX[@]}" --num-seeds 2 --grid update-epochs=4,10,20,40,80 --variants none $(both 0.03) ;;
+    targets) sweep targets --env-ids "${SIX[@]}" --num-seeds 2 --grid update-epochs=10,80 --variants $(both 0.015 0.05) ;;
+    seeds) sweep seeds --env-ids "${SIX[@]}" --start-seed 3 --num-seeds 3 --grid update-epochs=10,80 --variants none $(both 0.03) ;;
+    all) sweep all --env-ids "${SIX[@]}" "${FIVE[@]}" --num-seeds 2 --grid update-epochs=4,10,20,40,80 \
+      --variants none $(both 0.015 0.02 0.025 0.03 0.05) ;;
+    *) echo "STAGES=$stage: must be first, targets, seeds or all" >&2; exit 2 ;;
+  esac
+done
