@@ -11,4 +11,4 @@ for seed in $SEEDS; do
     echo "--env-id kle/$task-v2 --seed $seed --run-dir $RUNS/$task-v2__seed$seed"
   done
 done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/ppo_continuous_kle.py --compile --checkpoint-interval 200000 --resume
-"$PYTHON" benchmark/report.py ppo_k10 --runs "$RUNS"
+"$PYTHON" benchmark/ppo_k10_report.py --runs "$RUNS"

@@ -14,7 +14,8 @@ from scipy import stats
 sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
 
 
-report, speed, apple, torcs = map(importlib.import_module, ("report", "speed", "apple_report", "torcs_report"))
+names = ("ppo_k10_report", "speed", "apple_report", "torcs_report")
+report, speed, apple, torcs = map(importlib.import_module, names)
 
 
 def test_interval_is_that_of_the_t_test():
@@ -45,7 +46,7 @@ def test_report_of_part_of_the_runs(tmp_path):
         fake_run(tmp_path / "runs", "HalfCheetah-v2", seed, values)
     (tmp_path / "runs" / "HalfCheetah-v2__seed3").mkdir()  # not finished
     fake_run(tmp_path / "runs", "HalfCheetah-v2", 4, [0.0] * 60, complete=False)  # ended early by --stop-at
-    report.ppo_k10(tmp_path / "runs", tmp_path / "out")
+    report.main(report.Args(tmp_path / "runs", tmp_path / "out"))
     with open(tmp_path / "out" / "runs.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [float(row["last_50"]) for row in rows] == pytest.approx(

@@ -1,0 +1,199 @@
+"""Tables and figures of chapter 4 from runs whose scores are known; statistics against rliable and scipy."""
+
+import csv
+import importlib
+import itertools
+import json
+import sys
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from scipy import stats
+
+sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
+report = importlib.import_module("report")
+
+UPDATES = "global_step,charts/update_iterations,losses/kl_exact_new_old\n"
+
+
+def write_run(
+    folder, task: str, method: str, k: int, target: float | None, seed: int, returns, iterations, **more
+) -> None:
+    """A run with an episode every 1,000 steps and an update every 2,048."""
+    run = folder / f"{task}_{method}_{k}_{target}_{seed}"
+    run.mkdir(parents=True)
+    lines = [f"{1000 * (i + 1)},{value},1000\n" for i, value in enumerate(returns)]
+    (run / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + "".join(lines))
+    lines = [f"{2048 * (i + 1)},{value},{0.002 * value}\n" for i, value in enumerate(iterations)]
+    (run / "updates.csv").write_text(UPDATES + "".join(lines))
+    about = {"env_id": f"kle/{task}", "kle_stop": method == "stop", "kle_rollback": method == "rollback"}
+    args = {**about, "d_target": target or 0.03, "update_epochs": k, "seed": seed, "batch_size": 2048}
+    (run / "args.json").write_text(json.dumps(args))
+    result = {"global_step": 2048 * len(iterations), "steps_per_second": 5_000.0, "training_seconds": 100.0}
+    (run / "result.json").write_text(json.dumps({**result, "complete": True, "script_sha256": "0" * 64, **more}))
+
+
+@pytest.fixture(scope="session")
+def study(tmp_path_factory):
+    """Two tasks, 102,400 steps: plain PPO is worse the farther K is from 10, early stops are as good as K = 10."""
+    folder, rng = tmp_path_factory.mktemp("study") / "runs", np.random.default_rng(0)
+    goals = {4: 60, 10: 100, 20: 80, 40: 40, 80: 10}
+    for task, seed, k in itertools.product(("Hopper-v2", "HalfCheetah-v2"), (1, 2), report.KS):
+        shape = np.linspace(0, 1, 102)
+        settings = [("PPO", None, goals[k], k), ("stop", 0.03, 99, 5), ("rollback", 0.03, 98, 5), ("stop", 0.05, 97, 6)]
+        for method, target, goal, mean in settings:
+            iterations = np.full(50, k) if method == "PPO" else np.minimum(k, np.linspace(mean - 2, mean + 2, 50))
+            returns = goal * shape + rng.normal(0, 0.5, 102)
+            write_run(folder, task, method, k, target, seed, returns, iterations)
+    write_run(folder, "Hopper-v2", "PPO", 10, None, 3, np.zeros(20), np.full(10, 10))  # 20,480 steps
+    (folder / "Hopper-v2_PPO_10_None_4").mkdir()  # not done
+    return folder
+
+
+@pytest.fixture(scope="session")
+def rows(study):
+    rows = [run["row"] for run in report.read_runs(study, 102_400, 1)]
+    for definition in report.SCORES:
+        report.normalise(rows, definition)
+    return rows
+
+
+# Reading
+def test_what_is_read_of_a_run(study):
+    run = report.read_run(102_400, study / "Hopper-v2_stop_80_0.03_2")
+    returns = np.loadtxt(study / "Hopper-v2_stop_80_0.03_2" / "episodes.csv", delimiter=",", skiprows=1)[:, 1]
+    row = run["row"]
+    assert (row["task"], row["method"], row["d_target"], row["K"], row["seed"]) == ("Hopper-v2", "stop", 0.03, 80, 2)
+    assert row["last_episode"] == pytest.approx(returns[-1], abs=1e-3)
+    assert row["last_50"] == pytest.approx(returns[-50:].mean(), abs=1e-3)
+    assert (row["least"], row["greatest"]) == pytest.approx((returns.min(), returns.max()), abs=1e-3)
+    assert row["iterations"] == pytest.approx(5) and row["iterations_last_quarter"] == pytest.approx(
+        7 - 5.5 * 4 / 49, abs=1e-3
+    )
+    assert row["mean_kl"] == pytest.approx(0.01) and row["steps"] == 102_400
+    assert run["curves"]["return"].shape == (report.BINS,)
+
+
+def test_the_first_part_of_longer_runs(study):
+    """With --steps 20480 every run counts, with its first 20 episodes alone."""
+    runs = report.read_runs(study, 20_480, 1)
+    assert len(runs) == 2 * 2 * 5 * 4 + 1
+    assert all(run["row"]["episodes"] == 20 and run["row"]["steps"] == 20_480 for run in runs)
+    assert runs[0]["row"]["training_seconds"] == pytest.approx(100 * 20_480 / 102_400)
+
+
+def test_curves_are_means_of_parts_of_a_run():
+    at = np.array([1, 10, 11, 25, 1000])
+    found = report.binned(at, np.array([1.0, 3, 5, 7, 9]), 1_000)
+    assert found[:3].tolist() == [2, 5, 7] and found[-1] == 9 and np.isnan(found[3:-1]).all()
+
+
+# Statistics
+def test_ner_in_both_definitions(rows):
+    task = [row for row in rows if row["task"] == "Hopper-v2"]
+    last = [row["last_episode"] for row in task]
+    for row in task:
+        expected = (row["last_episode"] - min(last)) / (max(last) - min(last))
+        assert row["as tabulated"] == pytest.approx(expected)
+        low, high = min(row["least"] for row in task), max(row["greatest"] for row in task)
+        assert row["as written"] == pytest.approx((row["last_50"] - low) / (high - low))
+    assert max(row["as tabulated"] for row in task) == 1 and min(row["as tabulated"] for row in task) == 0
+
+
+def test_interquartile_mean_and_its_interval_are_rliable_s():
+    metrics, library = (importlib.import_module(f"rliable.{name}") for name in ("metrics", "library"))
+    scores = np.random.default_rng(1).gamma(2, 1, (5, 11))  # runs, tasks
+    ours = {str(i): scores[:, i] for i in range(11)}
+    assert float(report.interquartile_mean(ours)) == pytest.approx(metrics.aggregate_iqm(scores), rel=1e-12)
+    middle, low, high = report.bootstrap(report.interquartile_mean, ours)
+    theirs, intervals = library.get_interval_estimates(
+        {"all": scores}, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=4_000
+    )
+    assert middle == pytest.approx(theirs["all"][0])
+    assert (low, high) == pytest.approx(tuple(intervals["all"].ravel()), abs=0.15 * (high - low))
+
+
+def test_interquartile_mean_is_scipy_s_trimmed_mean():
+    for runs in (1, 2, 3, 7, 10):
+        scores = np.random.default_rng(runs).normal(size=(runs, 3))
+        ours = {str(i): scores[:, i] for i in range(3)}
+        assert float(report.interquartile_mean(ours)) == pytest.approx(stats.trim_mean(scores.ravel(), 0.25))
+
+
+def test_the_interval_of_a_difference_covers_it_as_often_as_it_says():
+    """95% intervals of 20 seeds in each of 3 tasks, 200 times."""
+    rng, hits = np.random.default_rng(0), 0
+    for _ in range(200):
+        a, b = ({task: rng.normal(mean, 1, 20) for task in "abc"} for mean in (1.0, 0.5))
+        _, low, high = report.bootstrap(lambda x, y: report.mean_of_tasks(x) - report.mean_of_tasks(y), a, b)
+        hits += low <= 0.5 <= high
+    assert 180 <= hits <= 199
+
+
+def test_spread_of_two_lists_of_settings():
+    settings = [{"a": np.array([1.0, 3]), "b": np.array([4.0])}, {"a": np.array([0.0, 0]), "b": np.array([1.0])}]
+    others = [{"a": np.array([5.0]), "b": np.array([5.0])}, {"a": np.array([4.5]), "b": np.array([4.5])}]
+    assert report.spread(2)(*settings, *others) == (3 - 0.5) - (5 - 4.5)
+
+
+# Tables
+def test_findings_of_a_study_that_is_as_the_thesis_says(rows):
+    found = {finding.claim: finding for finding in report.findings(rows, "as written")}
+    assert found["PPO: K = 10 above K = 80 (unlearning)"].verdict == "confirmed"
+    assert found["KL divergence: PPO at K = 80 above K = 10"].verdict == "confirmed"
+    assert found["K = 80: KLE-Stop 0.03 above PPO"].verdict == "confirmed"
+    assert found["KLE-Rollback 0.03 at K = 80 above PPO at its best K (10)"].verdict in ("contradicted", "open")
+    late = found["KLE-Stop 0.03, K = 80: more iterations in the last quarter than in the first"]
+    assert late.verdict == "confirmed" and late.measured.startswith("+3.1 [+3.1, +3.1], 2 tasks, 2 seeds")
+    few = "KLE-Stop, K = 80: d_target matters less than K (range over K less range over d_target)"
+    assert found[few].verdict == "confirmed" and "5 K, 2 d_target" in found[few].measured
+    assert not any("KLE-Rollback, K" in claim for claim in found)  # it has one d_target
+
+
+def test_a_claim_that_is_wrong_is_contradicted(rows):
+    worse, better = report.select(rows, "PPO", 80), report.select(rows, "PPO", 10)
+    finding = report.difference("80 above 10", "", worse, better, "as written")
+    assert finding.verdict == "contradicted" and "[-" in finding.measured
+    assert report.difference("none", "", worse, [], "as written") is None
+
+
+def test_the_whole_report(study, tmp_path):
+    report.main(report.Args(runs=study, steps=102_400, out=tmp_path / "out", workers=1))
+    text = (tmp_path / "out" / "tables.md").read_text()
+    assert "80 runs of 102,400 steps, 80 of them of the study's 1,210" in text and "2 of 11 tasks" in text
+    assert "published / as tabulated" not in text  # 102,400 steps are not what was published
+    assert "| KLE-Stop, d_target = 0.03 | " in text and "| Hopper-v2 | " in text
+    with open(tmp_path / "out" / "runs.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == 80
+    names = {path.name for path in (tmp_path / "out").glob("*.png")}
+    figures = {"fig_4_1", "fig_4_2", "fig_4_3", "learning_curves", "heat_map", "profiles"}
+    assert names == {f"{name}.png" for name in figures}
+    tex = (tmp_path / "out" / "tables.tex").read_text()
+    assert tex.count(r"\begin{tabular}") == tex.count(r"\end{table}") == 6 and "$d_\\mathrm{target}$ = 0.03 &" in tex
+
+
+def test_published_numbers_stand_beside_whole_runs(rows):
+    tables = report.tables(rows, is_whole=True)
+    lines = {line[0]: line for line in next(iter(tables.values()))}
+    assert lines["PPO"][2].startswith("0.65 / ") and lines["KLE-Stop, d_target = 0.03"][4].startswith("0.77 / ")
+    assert lines["KLE-Rollback, d_target = 0.025"][5] == "0.72"  # not measured here
+    iterations = {line[0]: line for line in list(tables.values())[1]}
+    assert iterations["KLE-Stop, d_target = 0.03"][5].startswith("10.56 / 5.00 / ")
+    returns = {line[0]: line for line in list(tables.values())[2]}
+    assert returns["Ant-v2"][1] == "1070.8" and returns["Hopper-v2"][2].startswith("2442.5 / ")
+
+
+def test_a_folder_without_runs_says_so(tmp_path):
+    with pytest.raises(SystemExit, match="holds no run of 2,000,000 steps"):
+        report.main(report.Args(runs=tmp_path, out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_cost_is_that_of_the_study_s_mixture():
+    rows = [{"task": "Ant-v2", "K": k, "steps_per_second": speed, "method": method, "d_target": "", "seed": 1}
+            for k in report.KS for method, speed in (("PPO", 1_000), ("stop", 4_000), ("rollback", 4_000))]  # fmt: skip
+    lines = {line[0]: line for line in report.cost_table(rows)}
+    hours = 5 * 2 * 2e6 * (1 / 1_000 + 10 / 4_000) / 3600
+    assert float(lines["Ant-v2"][-1]) == pytest.approx(hours, abs=0.06)
+    assert lines["sum of 1 tasks"][-1] == lines["Ant-v2"][-1] and lines["Hopper-v2"][-1] == ""
