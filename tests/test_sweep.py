@@ -13,7 +13,8 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import ROOT
+from conftest import ROOT, assert_same_run
+from conftest import SMALL as PPO
 
 sys.path.insert(0, str(ROOT / "benchmark"))
 sweep = importlib.import_module("sweep")
@@ -28,9 +29,9 @@ def start(flags: list, folder: Path) -> subprocess.Popen:
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def run(flags: list, folder: Path, code: int = 0) -> tuple[str, str]:
+def run(flags: list, folder: Path, code: int = 0, timeout: float = 100) -> tuple[str, str]:
     process = start(flags, folder)
-    out, err = process.communicate(timeout=100)
+    out, err = process.communicate(timeout=timeout)
     assert process.returncode == code, out + err
     return out, err
 
@@ -162,28 +163,68 @@ def test_a_run_that_is_busy_is_waited_for(tmp_path, monkeypatch):
     assert process.returncode == 0 and ends(tmp_path) == [1]
 
 
+def kill_at_random(flags: list, folder: Path, most: int, longest: float) -> int:
+    """SIGKILL the runner or one of its workers at random moments and send it again, until all is done; number of kills."""
+    rng, kills = random.Random(1), 0
+    process = start(flags, folder)
+    while process.poll() is None or process.returncode != 0:
+        time.sleep(rng.uniform(0, longest))
+        if process.poll() is not None:
+            assert process.returncode in (0, -signal.SIGKILL), process.communicate()
+            process = start(flags, folder) if process.returncode else process
+            continue
+        children = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
+        if kills < most:
+            os.kill(process.pid if rng.random() < 0.3 or not children else int(rng.choice(children)), signal.SIGKILL)
+            kills += 1
+    process.communicate()
+    return kills
+
+
 def test_random_kills_of_the_runner_and_of_its_workers_lose_nothing(tmp_path):
-    """SIGKILL at any moment, then sent again, until all is done: every run's steps are there once, and one end."""
+    """Every run's steps are there once, and one end."""
     flags = [*SMALL, "--num-seeds", "4", "--retries", "100"]
     whole = tmp_path / "whole"
     whole.mkdir()
     run(flags, whole)
-    rng, kills = random.Random(1), 0
-    process = start(flags, tmp_path)
-    while process.poll() is None or process.returncode != 0:
-        time.sleep(rng.uniform(0, 0.15))
-        if process.poll() is not None:
-            assert process.returncode in (0, -signal.SIGKILL)
-            process = start(flags, tmp_path)
-            continue
-        children = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
-        victim = process.pid if rng.random() < 0.3 or not children else int(rng.choice(children))
-        if kills < 20:
-            os.kill(victim, signal.SIGKILL)
-            kills += 1
-    assert kills >= 10
-    process.communicate()
+    assert kill_at_random(flags, tmp_path, 20, 0.15) >= 10
     assert records(tmp_path) == records(whole) and ends(tmp_path) == [1] * 16
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_fifty_random_kills_during_a_sweep_of_ppo(tmp_path):
+    """Twelve runs end with the bytes, and the tables, of a sweep that was left alone; each was finished once."""
+    script = ROOT / "cleanrl_thesis" / "ppo_continuous_kle.py"
+    flags = ["--command", f"{sys.executable} {script} {' '.join(PPO[2:])}", "--env-ids", "Pendulum-v1"]
+    flags += ["--num-seeds", "4", "--grid", "update-epochs=2,4", "--variants", "none", "kle-stop,d-target=0.001"]
+    flags += ["--workers", "2", "--retries", "100", "--runs", "runs"]
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    run(flags, whole, timeout=600)
+    assert kill_at_random(flags, tmp_path, 50, 3.0) == 50
+    folders = sorted((tmp_path / "runs").glob("*__seed*"))
+    assert len(folders) == 16
+    for folder in folders:
+        assert_same_run(whole / "runs" / folder.name, folder)
+    for folder in (whole, tmp_path):
+        report = [sys.executable, ROOT / "benchmark" / "report.py", "--runs", "runs", "--steps", "2560", "--out", "out"]
+        subprocess.run(report, cwd=folder, check=True, capture_output=True)
+    tables = [(folder / "out" / "tables.md").read_text() for folder in (whole, tmp_path)]
+    assert tables[0].split("## Cost")[0].split("\n", 2)[2] == tables[1].split("## Cost")[0].split("\n", 2)[2]
+
+
+def test_a_full_disk_stops_the_sweep_and_loses_nothing(tmp_path):
+    """The log of the third run cannot be written."""
+    log = tmp_path / "runs" / "logs" / "A-v0__bonus=5__seed1.log"
+    log.parent.mkdir(parents=True)
+    log.symlink_to("/dev/full")
+    _, err = run([*SMALL, "--workers", "1"], tmp_path, code=1)
+    assert "A-v0__bonus=5__seed1 could not be started: [Errno 28] No space left" in err and "goes on" in err
+    assert ends(tmp_path) == [1, 1]
+    log.unlink()
+    run([*SMALL, "--workers", "1"], tmp_path)
+    assert ends(tmp_path) == [1] * 8
 
 
 # What a user can get wrong
