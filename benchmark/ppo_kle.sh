@@ -2,7 +2,7 @@
 # The study of chapter 4: 11 tasks × K {4, 10, 20, 40, 80} × {plain, KLE-Stop and KLE-Rollback at five d_target} × 2 seeds,
 # 1,210 runs. Can be sent again after every stop; stages share their runs.
 #   benchmark/ppo_kle.sh                                                         all 1,210, 2,000,000 steps each
-#   STAGES="first targets seeds" STOP_AT=500000 benchmark/ppo_kle.sh             the 384 runs of benchmark/results/ppo_kle
+#   STAGES="first targets seeds others" STOP_AT=500000 benchmark/ppo_kle.sh      the 459 runs of benchmark/results/ppo_kle
 #   WORKERS=200 SLURM=benchmark/slurm_template.sh benchmark/ppo_kle.sh           on a cluster, 200 runs at a time
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -19,8 +19,9 @@ for stage in $STAGES; do
     first) sweep first --env-ids "${SIX[@]}" --num-seeds 2 --grid update-epochs=4,10,20,40,80 --variants none $(both 0.03) ;;
     targets) sweep targets --env-ids "${SIX[@]}" --num-seeds 2 --grid update-epochs=10,80 --variants $(both 0.015 0.05) ;;
     seeds) sweep seeds --env-ids "${SIX[@]}" --start-seed 3 --num-seeds 3 --grid update-epochs=10,80 --variants none $(both 0.03) ;;
+    others) sweep others --env-ids "${FIVE[@]}" --num-seeds 1 --grid update-epochs=4,10,20,40,80 --variants none $(both 0.03) ;;
     all) sweep all --env-ids "${SIX[@]}" "${FIVE[@]}" --num-seeds 2 --grid update-epochs=4,10,20,40,80 \
       --variants none $(both 0.015 0.02 0.025 0.03 0.05) ;;
-    *) echo "STAGES=$stage: must be first, targets, seeds or all" >&2; exit 2 ;;
+    *) echo "STAGES=$stage: must be first, targets, seeds, others or all" >&2; exit 2 ;;
   esac
 done

@@ -71,24 +71,27 @@ def binned(at: np.ndarray, values: np.ndarray, steps: int) -> np.ndarray:
         return (np.bincount(bins, values, BINS) / counts).astype(np.float32)
 
 
-def read_run(steps: int, folder: Path) -> dict | None:
-    """What the report needs of a run's first `steps`: a row for `runs.csv`, and curves of BINS numbers; None without them."""
+def read_run(steps: int, folder: Path) -> dict:
+    """A row for `runs.csv` from a run's first `steps`, and curves of BINS numbers; without them, its speed alone."""
     args, result = (json.loads((folder / name).read_text()) for name in ("args.json", "result.json"))
-    if result["global_step"] < steps - args["batch_size"]:
-        return None
-    at, returns = read_table(folder / "episodes.csv", ("global_step", "episodic_return"))
-    names = ("global_step", "charts/update_iterations", "losses/kl_exact_new_old")
-    update, iterations, kl = read_table(folder / "updates.csv", names)
-    returns, at = returns[at <= steps], at[at <= steps]
-    iterations, kl, update = iterations[update <= steps], kl[update <= steps], update[update <= steps]
     method = "stop" if args["kle_stop"] else "rollback" if args["kle_rollback"] else "PPO"
-    early, quarter = update <= 500_000, len(update) // 4
     row = {
         "task": args["env_id"].removeprefix("kle/"),
         "method": method,
         "d_target": args["d_target"] if method != "PPO" else "",
         "K": args["update_epochs"],
         "seed": args["seed"],
+        "steps_per_second": round(result["steps_per_second"], 1),
+    }
+    if result["global_step"] < steps - args["batch_size"]:
+        return {"row": row}
+    at, returns = read_table(folder / "episodes.csv", ("global_step", "episodic_return"))
+    names = ("global_step", "charts/update_iterations", "losses/kl_exact_new_old")
+    update, iterations, kl = read_table(folder / "updates.csv", names)
+    returns, at = returns[at <= steps], at[at <= steps]
+    iterations, kl, update = iterations[update <= steps], kl[update <= steps], update[update <= steps]
+    early, quarter = update <= 500_000, len(update) // 4
+    row |= {
         "steps": int(update[-1]),
         "episodes": len(returns),
         "last_episode": round(float(returns[-1]), 3),
@@ -100,7 +103,6 @@ def read_run(steps: int, folder: Path) -> dict | None:
         "iterations_first_quarter": round(float(iterations[:quarter].mean()), 3),
         "iterations_last_quarter": round(float(iterations[-quarter:].mean()), 3),
         "mean_kl": round(float(kl.mean()), 5),
-        "steps_per_second": round(result["steps_per_second"], 1),
         "training_seconds": round(result["training_seconds"] * update[-1] / result["global_step"], 1),
         "script_sha256": result["script_sha256"][:12],
     }
@@ -109,10 +111,10 @@ def read_run(steps: int, folder: Path) -> dict | None:
 
 
 def read_runs(folder: Path, steps: int, workers: int) -> list[dict]:
-    """All runs that have come to `steps`, in the order of their settings."""
+    """All runs in the order of their settings; those that have not come to `steps` have no curves."""
     folders = sorted(path.parent for path in folder.glob("*/result.json"))
     with ProcessPoolExecutor(workers) as pool:
-        runs = [run for run in pool.map(partial(read_run, steps), folders, chunksize=8) if run is not None]
+        runs = list(pool.map(partial(read_run, steps), folders, chunksize=8))
     return sorted(runs, key=lambda run: [str(run["row"][key]) for key in ("task", "method", "d_target", "K", "seed")])
 
 
@@ -613,8 +615,11 @@ def provenance(rows: list[dict], args: Args) -> str:
     )
 
 
-def tables(rows: list[dict], is_whole: bool) -> dict[str, list[list[str]]]:
-    """All tables by their captions; published numbers, which are of 2,000,000 steps, only beside whole runs."""
+def tables(rows: list[dict], all_rows: list[dict], is_whole: bool) -> dict[str, list[list[str]]]:
+    """All tables by their captions; published numbers, which are of 2,000,000 steps, only beside whole runs.
+
+    Speeds are those of `all_rows`, of runs that have not come so far too.
+    """
     ner, iterations, returns = ({}, {}, {})
     if is_whole:
         ner, iterations = published("table_4_2.csv"), published("table_4_3.csv")
@@ -631,12 +636,15 @@ def tables(rows: list[dict], is_whole: bool) -> dict[str, list[list[str]]]:
         f"Table 4.4: return of plain PPO, {old}last episode / last 50 episodes": table_4_4(rows, returns),
         "Findings of section 4.5, by the NER as written": findings_table(rows, written),
         "Interquartile mean of the NER as written, with its 95% interval": iqm_table(rows, written),
-        "Cost: steps per second, one thread": cost_table(rows),
+        "Cost: median steps per second of all runs, also shorter ones, one thread; core-hours of 2,000,000 steps": cost_table(
+            all_rows
+        ),
     }
 
 
 def main(args: Args) -> None:
-    runs = read_runs(args.runs, args.steps, args.workers)
+    found = read_runs(args.runs, args.steps, args.workers)
+    runs = [run for run in found if "curves" in run]
     if not runs:
         raise SystemExit(f"--runs {args.runs}: holds no run of {args.steps:,} steps")
     out = args.out or ROOT / "benchmark" / "results" / "ppo_kle" / f"{args.steps}"
@@ -645,7 +653,7 @@ def main(args: Args) -> None:
     write_csv(out / "runs.csv", rows)
     for definition in SCORES:
         normalise(rows, definition)
-    made = tables(rows, args.steps == 2_000_000)
+    made = tables(rows, [run["row"] for run in found], args.steps == 2_000_000)
     text = provenance(rows, args) + "\n".join(f"## {name}\n\n{markdown(lines)}" for name, lines in made.items())
     (out / "tables.md").write_text(text)
     (out / "tables.tex").write_text("\n".join(latex(lines, name) for name, lines in made.items()))
