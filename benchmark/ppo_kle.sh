@@ -15,6 +15,14 @@ sweep() {  # name of the stage, then what differs
 }
 both() { for target in "$@"; do echo "kle-stop,d-target=$target" "kle-rollback,d-target=$target"; done; }
 for stage in $STAGES; do
+  case $stage in first | targets | seeds | others | all) ;; *)
+    echo "STAGES=$STAGES: must be of first, targets, seeds, others and all" >&2
+    exit 2
+    ;;
+  esac
+done
+code=0
+for stage in $STAGES; do
   case $stage in
     first) sweep first --env-ids "${SIX[@]}" --num-seeds 2 --grid update-epochs=4,10,20,40,80 --variants none $(both 0.03) ;;
     targets) sweep targets --env-ids "${SIX[@]}" --num-seeds 2 --grid update-epochs=10,80 --variants $(both 0.015 0.05) ;;
@@ -22,6 +30,7 @@ for stage in $STAGES; do
     others) sweep others --env-ids "${FIVE[@]}" --num-seeds 1 --grid update-epochs=4,10,20,40,80 --variants none $(both 0.03) ;;
     all) sweep all --env-ids "${SIX[@]}" "${FIVE[@]}" --num-seeds 2 --grid update-epochs=4,10,20,40,80 \
       --variants none $(both 0.015 0.02 0.025 0.03 0.05) ;;
-    *) echo "STAGES=$stage: must be first, targets, seeds, others or all" >&2; exit 2 ;;
-  esac
+  esac || code=$?
+  if [ "$code" -gt 1 ]; then break; fi  # failed runs, code 1, do not keep the next stage from starting
 done
+exit "$code"

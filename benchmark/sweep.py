@@ -14,11 +14,13 @@ end, as all scripts here do.
 """
 
 import fcntl
+import hashlib
 import itertools
 import json
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -159,21 +161,25 @@ def read_manifest(path: Path) -> list[Run]:
 
 
 def open_manifest(args: Args, runs: list[Run]) -> None:
-    """Write the manifest, or see that it is the one that is there. Raises UsageError where it is another."""
-    path, ours = manifest_path(args), {run.name: run.command for run in runs}
-    if path.exists():
-        old = read_manifest(path)
-        at = next((i for i, (a, b) in enumerate(zip(old, runs)) if a != b), min(len(old), len(runs)))
-        differs = f"{path}: is of another sweep, from run {at + 1} of {len(old)} on; give another --name or --runs"
-        require(old == runs, differs)
+    """Write the manifest, unless it is there. Raises UsageError where runs were begun otherwise."""
+    path = manifest_path(args)
+    manifests = {other: read_manifest(other) for other in sorted(args.runs.glob("*.jsonl"))}
+    if manifests.get(path) == runs:
         return
-    for other in sorted(args.runs.glob("*.jsonl")):
-        for run in read_manifest(other):
-            same = ours.get(run.name, run.command) == run.command
-            require(same, f"{other}: has another command for {run.name}; give another --runs")
+    begun = [run for run in manifests.pop(path, []) if (args.runs / run.name).exists()]
+    differs = f"{path}: is of another sweep, which has begun {len(begun)} runs; give another --name or --runs"
+    require(not begun, differs)
+    known = {run.name: (run.command, other) for other, old in manifests.items() for run in old}
+    for run in runs:
+        if (args.runs / run.name).exists():
+            command, other = known.get(run.name, ((), path))
+            require(command == run.command, f"{args.runs / run.name}: {other} has no such run; give another --runs")
     args.runs.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".tmp")
-    draft.write_text("".join(run.line() + "\n" for run in runs))
+    with open(draft, "w") as file:
+        file.writelines(run.line() + "\n" for run in runs)
+        file.flush()
+        os.fsync(file.fileno())
     draft.replace(path)
 
 
@@ -208,7 +214,7 @@ class Sweep:
     failed: dict[Run, int] = field(default_factory=dict)  # with the exit code
     failures: Counter[Run] = field(default_factory=Counter)
     seconds: dict[str, list[float]] = field(default_factory=dict)  # of training, by setting
-    has_finished_one: bool = False  # since it was started
+    first: Run | None = None  # whose failure ends the sweep, while nothing is done
     stopped: str = ""  # why nothing more is started
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -222,12 +228,14 @@ def begin_sweep(args: Args, runs: list[Run]) -> Sweep:
             count_done(sweep, run, result)
         else:
             sweep.waiting.append(run)
+    if not sweep.done and sweep.waiting:
+        sweep.first = sweep.waiting[0]
     return sweep
 
 
 def count_done(sweep: Sweep, run: Run, result: dict) -> None:
     sweep.done += 1
-    sweep.seconds.setdefault(run.setting(), []).append(result["training_seconds"])
+    sweep.seconds.setdefault(run.setting(), []).append(result.get("training_seconds", 0.0))
 
 
 def command_of(args: Args, run: Run) -> list[str]:
@@ -255,7 +263,13 @@ def start(args: Args, run: Run) -> subprocess.Popen:
         log.flush()
         environment = {**os.environ, **THREADS}
         streams = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": subprocess.STDOUT}
-        return subprocess.Popen(command_of(args, run), **streams, env=environment, start_new_session=True)
+        command = [*leash(), *command_of(args, run)]
+        return subprocess.Popen(command, **streams, env=environment, start_new_session=True)
+
+
+def leash() -> list[str]:
+    """Words that let a run write a checkpoint and end when this script is killed; none where util-linux is missing."""
+    return ["setpriv", "--pdeathsig", "TERM", "--"] if shutil.which("setpriv") else []
 
 
 def settle(args: Args, sweep: Sweep, run: Run, code: int) -> bool:
@@ -265,23 +279,29 @@ def settle(args: Args, sweep: Sweep, run: Run, code: int) -> bool:
     is_busy = code == 2 and BUSY in log_end(args, run, 1)
     if code == 0 and is_done(result, args.stop_at):
         count_done(sweep, run, result)
-        sweep.has_finished_one = True
-        return False
-    if is_busy or sweep.stopped:
+    elif is_busy or sweep.stopped:
         sweep.waiting.append(run)
-        return is_busy
-    sweep.failures[run] += 1
-    if code != 2 and sweep.failures[run] <= args.retries:
-        sweep.waiting.append(run)
-        return False
-    sweep.failed[run] = code
-    if not sweep.has_finished_one:
-        sweep.stopped = "the first run failed, so nothing more was started"
-    return False
+    else:
+        sweep.failures[run] += 1
+        if code != 2 and sweep.failures[run] <= args.retries:
+            sweep.waiting.appendleft(run)
+        else:
+            sweep.failed[run] = code
+            if run == sweep.first:
+                sweep.stopped = "the first run failed, so the others were stopped"
+    return is_busy
 
 
 def work(args: Args, sweep: Sweep) -> None:
-    """One worker: run after run until none is waiting."""
+    """One worker; what it fails of ends the sweep."""
+    try:
+        run_waiting(args, sweep)
+    except Exception as error:
+        sweep.stopped = f"failed: {error!r}"
+
+
+def run_waiting(args: Args, sweep: Sweep) -> None:
+    """Run after run until none is waiting."""
     while True:
         with sweep.lock:
             if sweep.stopped or not sweep.waiting:
@@ -291,7 +311,7 @@ def work(args: Args, sweep: Sweep) -> None:
                 process = start(args, run)
             except OSError as error:
                 sweep.waiting.appendleft(run)
-                sweep.stopped = f"{run.name} could not be started: {error}"
+                sweep.stopped = sweep.stopped or f"{run.name} could not be started: {error}"
                 return
             sweep.running[run] = process, time.monotonic()
         code = process.wait()
@@ -330,6 +350,8 @@ def show(sweep: Sweep, shown: list[str]) -> list[str]:
     with sweep.lock:
         lines = live_table(sweep)
     if sys.stdout.isatty():
+        size = shutil.get_terminal_size()
+        lines = [line[: size.columns - 1] for line in lines[: size.lines - 1]]
         up = f"\033[{len(shown)}F" if shown else ""
         print(f"{up}\033[J" + "\n".join(lines), flush=True)
     elif lines[0] != (shown or [""])[0]:
@@ -345,13 +367,13 @@ def signal_all(sweep: Sweep, number: int) -> None:
 
 @dataclass
 class Signals:
-    """Ctrl-C and SIGTERM as they come: the first lets all runs write a checkpoint, the second kills them."""
+    """Ctrl-C, SIGTERM and SIGHUP as they come: the first lets all runs write a checkpoint, the second kills them."""
 
     received: list[int] = field(default_factory=list)
     obeyed: int = 0
 
     def install(self) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda number, frame: self.received.append(number))
 
     def obey(self, sweep: Sweep) -> None:
@@ -368,7 +390,7 @@ def run_here(args: Args, runs: list[Run]) -> int:
     with open(manifest_path(args)) as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise UsageError(f"{manifest_path(args)}: this sweep is running") from None
         signals = Signals()
         signals.install()
@@ -376,24 +398,39 @@ def run_here(args: Args, runs: list[Run]) -> int:
         workers = [threading.Thread(target=work, args=(args, sweep), daemon=True) for _ in range(args.workers)]
         for worker in workers:
             worker.start()
-        shown: list[str] = []
-        while any(worker.is_alive() for worker in workers):
-            signals.obey(sweep)
-            shown = show(sweep, shown)
-            time.sleep(0.2)
-        show(sweep, shown)
+        try:
+            watch(sweep, workers, signals)
+        finally:  # also where the table cannot be printed: no run is left behind
+            if any(worker.is_alive() for worker in workers):
+                sweep.stopped = sweep.stopped or "interrupted"
+                signal_all(sweep, signal.SIGTERM)
+            for worker in workers:
+                worker.join()
     return report_end(args, sweep, signals)
+
+
+def watch(sweep: Sweep, workers: list[threading.Thread], signals: Signals) -> None:
+    """Show what goes on until all workers have ended."""
+    shown, is_stopping = [], False
+    while any(worker.is_alive() for worker in workers):
+        signals.obey(sweep)
+        if sweep.stopped and not signals.obeyed and not is_stopping:
+            is_stopping = True
+            signal_all(sweep, signal.SIGTERM)
+        shown = show(sweep, shown)
+        time.sleep(0.2)
+    show(sweep, shown)
 
 
 def report_end(args: Args, sweep: Sweep, signals: Signals) -> int:
     """Say what failed and what is left. Returns the exit code."""
     for run, code in sweep.failed.items():
         print(f"failed: {run.name} (exit code {code}, {log_path(args, run)}):\n{log_end(args, run)}", file=sys.stderr)
-    if sweep.waiting:
+    if sweep.stopped:
         print(f"{sweep.stopped}; sent again, the sweep goes on", file=sys.stderr)
     if signals.received:
         return 128 + signals.received[0]
-    return 1 if sweep.failed or sweep.waiting else 0
+    return 1 if sweep.failed or sweep.stopped else 0
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -435,14 +472,17 @@ def chunks(items: list[int], size: int) -> Iterator[list[int]]:
 
 
 def submit(args: Args, runs: list[Run]) -> int:
-    """Submit what is not done as arrays of at most `--slurm-chunk` tasks. Raises UsageError."""
-    job_name = f"{args.runs.name}-{args.name}"
-    queued = slurm("squeue", "--noheader", "--format=%A", f"--name={job_name}")
+    """Submit what is not done as arrays of at most `--slurm-chunk` tasks, one after the other. Raises UsageError."""
+    folder = str(args.runs.resolve())
+    require(not re.search(r"\s", folder), f"--runs {args.runs}: must be without blanks for Slurm")
+    job_name = f"{args.runs.name}-{args.name}-{hashlib.sha256(folder.encode()).hexdigest()[:6]}"
+    queued = slurm("squeue", "--me", "--noheader", "--format=%A", f"--name={job_name}")
     require(not queued, f"--name {args.name}: jobs of this sweep are still queued, squeue --name={job_name}")
     left = [i for i, run in enumerate(runs) if not is_done(read_result(args.runs / run.name), args.stop_at)]
     template = args.slurm_template_path.read_text()
-    for folder in ("slurm", "logs"):
-        (args.runs / folder).mkdir(exist_ok=True)
+    for part in ("slurm", "logs"):
+        (args.runs / part).mkdir(exist_ok=True)
+    after: list[str] = []
     one = [sys.executable, str(Path(__file__).resolve()), "--runs", str(args.runs), "--name", args.name]
     one += [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
     for number, lines in enumerate(chunks(left, args.slurm_chunk)):
@@ -450,13 +490,15 @@ def submit(args: Args, runs: list[Run]) -> int:
             "name": job_name,
             "array": f"0-{len(lines) - 1}%{args.workers}",
             "lines": " ".join(map(str, lines)),
-            "logs": str((args.runs / "logs").resolve()),
+            "logs": f"{folder}/logs",
             "retries": str(args.retries),
             "command": shlex.join([*one, "--only"]),
         }
         script = args.runs / "slurm" / f"{args.name}_{number}.sh"
         script.write_text(fill(template, values))
-        print(f"{len(lines)} runs in job {slurm('sbatch', '--parsable', str(script))} ({script})")
+        job = slurm("sbatch", "--parsable", *after, str(script))
+        print(f"{len(lines)} runs in job {job} ({script})")
+        after = [f"--dependency=afterany:{job}"]  # so that --workers holds for all of them
     if not left:
         print(f"all {len(runs)} runs are done")
     return 0

@@ -17,10 +17,11 @@ PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "scontrol", "squeue")
 MISSING = [name for name in PROGRAMS if shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin") is None]
 pytestmark = [
     pytest.mark.skipif(
-        bool(MISSING), reason=f"{', '.join(MISSING)} not installed: apt-get install slurmctld slurmd munge"
+        bool(MISSING), reason=f"{', '.join(MISSING)} not installed: apt-get install slurmctld slurmd slurm-client munge"
     ),
     pytest.mark.skipif(os.geteuid() != 0, reason="slurmd needs root to start jobs"),
     pytest.mark.timeout(600),
+    pytest.mark.slow,
 ]
 CONFIGURATION = """
 ClusterName=test
@@ -132,7 +133,7 @@ class Cluster:
             daemon.kill()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     folder = tmp_path_factory.mktemp("slurm")
     cluster = Cluster(folder)
@@ -142,8 +143,8 @@ def cluster(tmp_path_factory):
         cluster.stop()
 
 
-def test_a_sweep_survives_the_death_of_a_node_and_a_preemption(cluster, tmp_path):
-    """Four runs on two nodes. One node dies, a task of the other gets Slurm's warning: all end as if undisturbed."""
+def test_a_sweep_survives_the_death_of_a_node_and_a_warning(cluster, tmp_path):
+    """Four runs on two nodes. One dies, a task of the other gets the signal by which Slurm warns: same bytes at the end."""
     flags = [*SMALL, "--total-timesteps", "40960", "--checkpoint-interval", "1024"]
     whole = tmp_path / "whole"
     for seed in (1, 2):
@@ -168,7 +169,7 @@ def test_a_sweep_survives_the_death_of_a_node_and_a_preemption(cluster, tmp_path
     jobs = cluster.ask("squeue", "--noheader", "--states=R", "--array", "--format=%i %N").split("\n")
     on_two = next(line.split()[0] for line in jobs if line.endswith(" two"))
     cluster.kill_node("one")
-    cluster.ask("scancel", "--batch", "--signal=USR1", on_two)
+    cluster.ask("scancel", "--batch", "--signal=USR1", on_two)  # Slurm itself looks at time limits twice a minute only
     wait_until(lambda: "down" in cluster.ask("sinfo", "--noheader", "--format=%T"), 60, "the dead node is found")
     cluster.start_node("one")
     wait_until(lambda: not cluster.ask("squeue", "--noheader"), 400, "an empty queue")
@@ -180,3 +181,20 @@ def test_a_sweep_survives_the_death_of_a_node_and_a_preemption(cluster, tmp_path
     assert logs.count("stopped by signal 10") == 1, logs
     log = (cluster.folder / "slurmctld.log").read_text()
     assert log.count("Requeu") + log.count("requeue") >= 2, log
+
+
+def test_a_crash_is_queued_again_and_a_mistake_is_not(cluster, tmp_path):
+    """Runs of milliseconds: one that crashes in its ninth step, and one of an environment that does not exist."""
+    toy = ROOT / "tests" / "data" / "toy_run.py"
+    words = ["--command", f"{sys.executable} -I {toy}", "--env-ids", "A-v0", "no/Such-v0", "--num-seeds", "1"]
+    words += ["--variants", "crash-at=9", "--workers", "2", "--runs", "runs"]
+    words += ["--slurm-template-path", str(ROOT / "benchmark" / "slurm_template.sh")]
+    sweep = [sys.executable, str(ROOT / "benchmark" / "sweep.py"), *words]
+    subprocess.run(sweep, env=cluster.environment, cwd=tmp_path, capture_output=True, check=True)
+    wait_until(lambda: not cluster.ask("squeue", "--noheader"), 120, "an empty queue")
+    steps = (tmp_path / "runs" / "A-v0__crash-at=9__seed1" / "steps.txt").read_text().splitlines()
+    assert [line.split()[0] for line in steps] == [str(i) for i in range(1, 21)]
+    logs = sorted((tmp_path / "runs" / "logs").glob("slurm_*.log"))
+    assert [log.read_text().count("invalid choice: 'no/Such-v0'") for log in logs] == [0, 1]
+    crashes = [path.read_text() for path in (tmp_path / "runs" / "logs").glob("crashes_*")]
+    assert crashes == ["exit code 134\n"]

@@ -63,12 +63,27 @@ def test_another_manifest_of_the_same_name_is_refused(tmp_path):
     run(SMALL, tmp_path)
     before = (tmp_path / "runs" / "sweep.jsonl").read_bytes()
     _, err = run([*SMALL, "--num-seeds", "3"], tmp_path, code=2)
-    assert "runs/sweep.jsonl" in err and "from run 9 of 8 on" in err and err.count("\n") == 1
+    assert "runs/sweep.jsonl: is of another sweep, which has begun 8 runs" in err and err.count("\n") == 1
     _, err = run([*SMALL, "--name", "other", "--variants", "double"], tmp_path)
     _, err = run([*SMALL, "--name", "third", "--command", f"{COMMAND[1]} --total 9"], tmp_path, code=2)
-    assert "has another command for A-v0__bonus=0__seed1" in err
+    assert "runs/A-v0__bonus=0__seed1: runs/sweep.jsonl has no such run" in err
     assert (tmp_path / "runs" / "sweep.jsonl").read_bytes() == before
     assert not (tmp_path / "runs" / "third.jsonl").exists()
+
+
+def test_a_manifest_of_which_nothing_has_begun_is_replaced(tmp_path):
+    """The first try had a misspelt flag."""
+    run([*SMALL, "--grid", "bonos=0,5"], tmp_path, code=1)
+    run(SMALL, tmp_path)
+    assert ends(tmp_path) == [1] * 8
+
+
+def test_runs_of_a_lost_manifest_are_not_taken_for_one_s_own(tmp_path):
+    run(SMALL, tmp_path)
+    (tmp_path / "runs" / "sweep.jsonl").unlink()
+    _, err = run([*SMALL, "--variants", "none", "--command", f"{COMMAND[1]} --total 9"], tmp_path, code=2)
+    assert "runs/A-v0__bonus=0__seed1: runs/sweep.jsonl has no such run; give another --runs" in err
+    assert ends(tmp_path) == [1] * 8
 
 
 def test_sweeps_in_one_folder_share_their_runs(tmp_path):
@@ -108,18 +123,46 @@ def test_a_run_that_crashes_is_started_again(tmp_path):
 
 
 def test_failed_runs_are_listed_with_their_last_words(tmp_path):
-    """B-v0 passes once A-v0 has finished; a flag's wrong value is not tried again."""
-    flags = [*COMMAND, "--env-ids", "A-v0", "no/Such-v0", "--num-seeds", "2", "--grid", "bonus=0"]
+    """A-v0 passes, also while the first run is not done; a flag's wrong value is not tried again."""
+    flags = [*COMMAND, "--env-ids", "A-v0", "no/Such-v0", "--num-seeds", "2", "--grid", "bonus=0", "--workers", "2"]
     _, err = run(flags, tmp_path, code=1)
     assert err.count("failed: ") == 2 and "failed: no_Such-v0__bonus=0__seed1 (exit code 2, " in err
     assert "invalid choice: 'no/Such-v0'" in err and ends(tmp_path) == [1, 1]
 
 
-@pytest.mark.parametrize("flags", [["--grid", "nonsense=1,2"], ["--command", "no_such_program"]])
-def test_a_command_that_cannot_work_is_told_after_the_first(flags, tmp_path):
-    out, err = run([*SMALL, "--num-seeds", "200", "--workers", "1", *flags], tmp_path, code=1)
-    assert ("no_such_program" if flags[0] == "--command" else "unrecognized arguments: --nonsense 1") in err
-    assert "sent again" in err and len(list((tmp_path / "runs" / "logs").iterdir())) == 1
+@pytest.mark.parametrize(
+    "flags, words, tries",
+    [
+        (["--grid", "nonsense=1,2"], "unrecognized arguments: --nonsense 1", 1),
+        (["--command", "no_such_program"], "no_such_program", None),
+        (["--command", f"{sys.executable} -c 1/0"], "ZeroDivisionError", 3),
+    ],
+)
+def test_a_command_that_cannot_work_is_told_after_the_first(flags, words, tries, tmp_path):
+    """Two workers: the first run ends the sweep once its tries are used up, however many are waiting."""
+    _, err = run([*SMALL, "--num-seeds", "200", *flags], tmp_path, code=1)
+    assert words in err and "sent again" in err
+    logs = list((tmp_path / "runs" / "logs").iterdir())
+    starts = [path.read_text().count("$ ") for path in logs if "A-v0__" in path.name and "seed1.log" in path.name]
+    assert len(logs) <= 5 and (tries is None or tries in starts)
+
+
+@pytest.mark.parametrize("end", ["kill", "full disk", "hangup"])
+def test_a_runner_that_dies_leaves_no_run_behind(end, tmp_path):
+    """Killed, with nowhere to print to, or with its terminal gone: the runs write a checkpoint and end."""
+    command = [sys.executable, str(SCRIPT), *SMALL, "--command", f"{COMMAND[1]} --total 400"]
+    with open("/dev/full" if end == "full disk" else os.devnull, "w") as out:
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=out, stderr=subprocess.PIPE)
+    while end != "full disk" and len(records(tmp_path)) < 2:
+        time.sleep(0.01)
+    if end != "full disk":
+        process.send_signal(signal.SIGKILL if end == "kill" else signal.SIGHUP)
+    process.communicate(timeout=20)
+    assert process.returncode == {"kill": -signal.SIGKILL, "full disk": 1, "hangup": 128 + signal.SIGHUP}[end]
+    time.sleep(0.3)
+    before = records(tmp_path)
+    time.sleep(0.3)
+    assert records(tmp_path) == before and ends(tmp_path) == []
 
 
 def test_ctrl_c_lets_runs_write_their_checkpoints(tmp_path):
@@ -147,11 +190,11 @@ def test_two_sweeps_at_once_are_refused(tmp_path):
     process.communicate(timeout=20)
 
 
-def test_a_run_that_is_busy_is_waited_for(tmp_path, monkeypatch):
+def test_a_run_that_is_busy_is_waited_for(tmp_path):
     """An earlier sweep was killed and has left a process behind."""
     flags = [*COMMAND, "--env-ids", "A-v0", "--num-seeds", "1", "--grid", "bonus=0", "--retries", "0"]
+    run([*flags, "--stop-at", "3"], tmp_path)
     folder = tmp_path / "runs" / "A-v0__bonus=0__seed1"
-    folder.mkdir(parents=True)
     lock = os.open(folder, os.O_RDONLY)
     fcntl.flock(lock, fcntl.LOCK_EX)
     process = start(flags, tmp_path)
@@ -160,7 +203,7 @@ def test_a_run_that_is_busy_is_waited_for(tmp_path, monkeypatch):
         time.sleep(0.05)
     os.close(lock)
     process.communicate(timeout=30)
-    assert process.returncode == 0 and ends(tmp_path) == [1]
+    assert process.returncode == 0 and ends(tmp_path) == [2]
 
 
 def kill_at_random(flags: list, folder: Path, most: int, longest: float) -> int:
@@ -194,7 +237,7 @@ def test_random_kills_of_the_runner_and_of_its_workers_lose_nothing(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_fifty_random_kills_during_a_sweep_of_ppo(tmp_path):
-    """Twelve runs end with the bytes, and the tables, of a sweep that was left alone; each was finished once."""
+    """Sixteen runs end with the bytes, and the tables, of a sweep that was left alone."""
     script = ROOT / "cleanrl_thesis" / "ppo_continuous_kle.py"
     flags = ["--command", f"{sys.executable} {script} {' '.join(PPO[2:])}", "--env-ids", "Pendulum-v1"]
     flags += ["--num-seeds", "4", "--grid", "update-epochs=2,4", "--variants", "none", "kle-stop,d-target=0.001"]
@@ -267,7 +310,10 @@ def test_only_becomes_one_line_of_the_manifest(tmp_path):
 
 def test_arrays_are_submitted_in_chunks_of_what_is_not_done(tmp_path, monkeypatch):
     """With stand-ins for squeue and sbatch, which keep what they are given."""
-    for name, body in (("squeue", ""), ("sbatch", 'cat "$2" >> submitted; echo 77')):
+    for name, body in (
+        ("squeue", ""),
+        ("sbatch", 'echo "$@" >> calls; for last; do :; done; cat "$last" >> submitted; echo 77'),
+    ):
         (tmp_path / "bin").mkdir(exist_ok=True)
         (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{body}\n")
         (tmp_path / "bin" / name).chmod(0o755)
@@ -280,6 +326,8 @@ def test_arrays_are_submitted_in_chunks_of_what_is_not_done(tmp_path, monkeypatc
     assert "{{" not in text and re.findall(r"--array=(\S+)", text) == ["0-4%4", "0-2%4"]
     assert re.findall(r"^lines=\((.*)\)", text, re.M) == ["4 5 6 7 8", "9 10 11"]
     assert "--runs runs --name more --stop-at 9 --only" in text
+    calls = (tmp_path / "calls").read_text().splitlines()
+    assert "--dependency" not in calls[0] and "--dependency=afterany:77" in calls[1]
     (tmp_path / "bin" / "squeue").write_text("#!/bin/sh\necho 77\n")
     _, err = run([*flags, "--slurm-template-path", ROOT / "benchmark" / "slurm_template.sh"], tmp_path, code=2)
     assert "still queued" in err
