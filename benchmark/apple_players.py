@@ -10,17 +10,15 @@ of 17 frames, 0.28 s, as people have; with 60 frames it would be 0.2 s, with 120
 are not fitted. Writes `benchmark/results/apple/players.csv` and `.md`.
 """
 
-import csv
 import importlib.util
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
+from common import ROOT, commit, published_table, write_csv
 
-ROOT = Path(__file__).resolve().parent.parent
 PLAYERS = {"shortest path": "DQN", "synthetic human": "human"}  # and the row of Table 2.1 that each is to be like
 
 QUICK = {"reaction": 4.0, "lapse": 0.0, "lag": 1.0, "pause": 3.0, "slip": 0.0}  # what the quick human has otherwise
@@ -46,20 +44,6 @@ def load_method(name: str):
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def published_table(name: str = "table_2_1.csv") -> dict[str, dict[str, str]]:
-    """The rows of a table by agent."""
-    with open(ROOT / "benchmark" / "published" / name, newline="") as file:
-        return {row["agent"]: row for row in csv.DictReader(file)}
-
-
-def git(*words: str) -> str:
-    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout
-
-
-def commit() -> str:
-    return git("describe", "--always", "--dirty").strip()
 
 
 def shortest_path(method):
@@ -106,7 +90,7 @@ def write_quick_demonstrations(method, args: Args) -> None:
 
 def neighbours(method, args: Args):
     """Rows at other constants: for each reach and lifetime the speed at which the shortest path scores as published."""
-    target = float(published_table()["DQN"]["avg"])
+    target = float(published_table("table_2_1.csv")["DQN"]["avg"])
     constants = method.SPEED, method.REACH, method.LIFETIME, method.SyntheticHuman.reaction
     for reach, lifetime in ((0.06, 45), (0.06, 60), (0.06, 75), (0.06, 90), (0.06, 120), (0.05, 90), (0.07, 90)):
         slow, fast = 0.006, 0.012
@@ -128,7 +112,7 @@ def table(rows: list[dict]) -> str:
     names = list(rows[0])
     lines = [f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
     for agent in PLAYERS.values():
-        row = published_table()[agent]
+        row = published_table("table_2_1.csv")[agent]
         cells = [f"Table 2.1: {agent}", "", "", "", "", 400, *(row[name] for name in ("avg", "std", "min", "max"))]
         lines.append(f"| {' | '.join(map(str, cells))} |")
     lines += [f"| {' | '.join(str(row[name]) for name in names)} |" for row in rows]
@@ -143,10 +127,7 @@ def main(args: Args) -> None:
     if args.calibrate:
         rows += neighbours(method, args)
     args.out.mkdir(parents=True, exist_ok=True)
-    with open(args.out / "players.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(args.out / "players.csv", rows)
     line = f"python benchmark/apple_players.py{' --calibrate' if args.calibrate else ''} --seed {args.seed}"
     (args.out / "players.md").write_text(f"`{line}`, commit {commit()}\n\n{table(rows)}")
     print(table(rows))

@@ -6,8 +6,6 @@ Takes whatever part of the runs of `benchmark/apple_alpha.sh` is done, and says 
 the seeds' means; each mean is over 400 episodes.
 """
 
-import csv
-import hashlib
 import itertools
 import json
 import re
@@ -22,7 +20,8 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 import tyro
-from apple_players import QUICK, ROOT, commit, git, load_method, published_table, shortest_path
+from apple_players import QUICK, load_method, shortest_path
+from common import ROOT, commit, commit_of, published_table, write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -121,7 +120,7 @@ def table_2_1(rows: list[dict], human: list[dict], shortest: list[dict]) -> str:
             for name, kind in students.items()
         },
     }
-    published = published_table()
+    published = published_table("table_2_1.csv")
     for agent, groups in measured.items():
         if agent in published:
             cells = [published[agent][name] for name in ("max", "min", "avg", "std")]
@@ -238,7 +237,7 @@ def figure_2_4(rows: list[dict], humans: dict[str, float]) -> Figure:
     panels = [("", ""), ("", "last_"), *([("quick_", "last_")] if "quick_" in humans else [])]
     figure = Figure(figsize=(11, 1 + 3.2 * len(panels)), layout="constrained")
     teacher, _ = interval([row["mean"] for row in select(rows, "teacher", "greedy")])
-    published = published_table()
+    published = published_table("table_2_1.csv")
     stars = {0.0: float(published["BC, α = 0"]["avg"]), 0.93: float(published["hybrid, α = 0.93"]["avg"])}
     every = sorted({temperature for group in humans for temperature in temperatures(rows, group)})
     colours = {temperature: f"C{i}" for i, temperature in enumerate(every)}
@@ -397,21 +396,6 @@ def likeness_table(method, folder: Path, seeds: list[int], episodes: int) -> str
         cells = (len(values["score"]), told, with_interval(values["reaction"], 0), with_interval(values["changes"], 1))
         lines.append(f"| {name} | {' | '.join(map(str, cells))} | {with_interval(values['score'], 1)} |")
     return "\n".join(lines) + "\n"
-
-
-def write_csv(path: Path, rows: list[dict]) -> None:
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def commit_of(script: str, digest: str) -> str:
-    """The newest commit whose script has this checksum."""
-    path = f"cleanrl_thesis/{script}.py"
-    commits = git("log", "--format=%h", "--", path).split()
-    found = (c for c in commits if hashlib.sha256(git("show", f"{c}:{path}").encode()).hexdigest().startswith(digest))
-    return next(found, "not recorded")
 
 
 def provenance(rows: list[dict], seeds: list[int]) -> str:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from apple_players import ROOT, commit
-from apple_report import commit_of, with_interval, write_csv
+from apple_report import with_interval
+from common import ROOT, commit, commit_of, write_csv
 
 
 @dataclass

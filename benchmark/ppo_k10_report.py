@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from common import write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -117,13 +118,6 @@ def ppo_k10_figure(published: list[dict], runs: list[dict], folder: Path) -> Fig
     figure.supylabel("episodic return, mean of 50 episodes")
     figure.suptitle("Plain PPO, K = 10, as run: measured (lines) and published (dashed)")
     return figure
-
-
-def write_csv(path: Path, rows: list[dict]) -> None:
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def main(args: Args) -> None:

@@ -6,11 +6,14 @@
 Takes whatever part of the 1,210 runs of `benchmark/ppo_kle.sh` has come to `--steps`, and says which. The normalised
 episode reward (NER) of a run is where its score lies between the least and the greatest of its task, in two definitions:
 *as tabulated* (Table 4.2, found out from the study's logs): score, least and greatest are of last episodes; *as written*
-(section 4.4): the mean of the last 50 episodes, between the least and the greatest of all episodes. Intervals are 95%
-percentiles of a bootstrap stratified by task, which with 2 seeds is rough.
+(section 4.4): the mean of the last 50 episodes, between the least and the greatest of all episodes. Least and greatest are
+those of the runs at hand.
+
+Intervals are 95% percentiles of a bootstrap stratified by task. Resamples of n seeds have (n - 1) / n of the variance that
+they should have, half with 2 seeds, so the deviations from a task's mean are stretched accordingly. A claim is confirmed
+where the interval is above 0, contradicted where it is below, and open else, or where a task has a single seed.
 """
 
-import csv
 import json
 import os
 from collections import defaultdict
@@ -19,11 +22,11 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import tyro
-from apple_players import ROOT, commit
-from apple_report import commit_of, write_csv
+from common import ROOT, commit, commit_of, published_rows, write_csv
 from matplotlib.figure import Figure
 
 METHODS = {"PPO": "PPO", "stop": "KLE-Stop", "rollback": "KLE-Rollback"}
@@ -38,6 +41,19 @@ SCORES = {
     "as written": ("last_50", "least", "greatest"),
 }
 RESAMPLES = 2_000
+SETTING = ("task", "method", "d_target", "K", "seed")  # what a run differs in
+FREE = {"env_id", "seed", "update_epochs", "kle_stop", "kle_rollback", "d_target"}  # and by which arguments
+FREE |= {"run_dir", "resume", "stop_at", "checkpoint_interval", "compile", "cuda", "num_threads", "exp_name"}
+FREE |= {"track", "wandb_project_name", "wandb_entity", "capture_video", "save_model", "save_demos", "eval_episodes"}
+FREE |= {"eval_mode", "kl_timing", "target_kl"}
+MARGIN = 0.1  # of the NER, within which a setting is near another
+AS_WRITTEN = (
+    0.67,
+    0.70,
+    0.59,
+    0.40,
+    0.35,
+)  # plain PPO's Table 4.2 by the definition of section 4.4, from the study's logs
 
 
 @dataclass
@@ -71,9 +87,21 @@ def binned(at: np.ndarray, values: np.ndarray, steps: int) -> np.ndarray:
         return (np.bincount(bins, values, BINS) / counts).astype(np.float32)
 
 
+def read_result(folder: Path) -> dict | None:
+    """What a run wrote at its end; None while it is not done, or goes on."""
+    try:
+        return json.loads((folder / "result.json").read_text())
+    except (OSError, ValueError):
+        return None
+
+
 def read_run(steps: int, folder: Path) -> dict:
     """A row for `runs.csv` from a run's first `steps`, and curves of BINS numbers; without them, its speed alone."""
-    args, result = (json.loads((folder / name).read_text()) for name in ("args.json", "result.json"))
+    args = json.loads((folder / "args.json").read_text())
+    at, returns = read_table(folder / "episodes.csv", ("global_step", "episodic_return"))
+    names = ("global_step", "charts/update_iterations", "losses/kl_exact_new_old")
+    update, iterations, kl = read_table(folder / "updates.csv", names)
+    result = read_result(folder)
     method = "stop" if args["kle_stop"] else "rollback" if args["kle_rollback"] else "PPO"
     row = {
         "task": args["env_id"].removeprefix("kle/"),
@@ -81,13 +109,13 @@ def read_run(steps: int, folder: Path) -> dict:
         "d_target": args["d_target"] if method != "PPO" else "",
         "K": args["update_epochs"],
         "seed": args["seed"],
-        "steps_per_second": round(result["steps_per_second"], 1),
     }
-    if result["global_step"] < steps - args["batch_size"]:
-        return {"row": row}
-    at, returns = read_table(folder / "episodes.csv", ("global_step", "episodic_return"))
-    names = ("global_step", "charts/update_iterations", "losses/kl_exact_new_old")
-    update, iterations, kl = read_table(folder / "updates.csv", names)
+    same = {name: value for name, value in args.items() if name not in FREE}
+    if result is not None:
+        row["seconds_per_step"] = 1 / result["steps_per_second"]
+        row["all_iterations"] = float(iterations.mean())
+    if not len(update) or update[-1] < steps - args["batch_size"] or not (at <= steps).any():
+        return {"row": row, "args": same}
     returns, at = returns[at <= steps], at[at <= steps]
     iterations, kl, update = iterations[update <= steps], kl[update <= steps], update[update <= steps]
     early, quarter = update <= 500_000, len(update) // 4
@@ -103,19 +131,30 @@ def read_run(steps: int, folder: Path) -> dict:
         "iterations_first_quarter": round(float(iterations[:quarter].mean()), 3),
         "iterations_last_quarter": round(float(iterations[-quarter:].mean()), 3),
         "mean_kl": round(float(kl.mean()), 5),
-        "training_seconds": round(result["training_seconds"] * update[-1] / result["global_step"], 1),
-        "script_sha256": result["script_sha256"][:12],
+        "log_kl": round(float(np.log10(np.maximum(kl, 1e-8)).mean()), 4),
+        "script_sha256": "" if result is None else result["script_sha256"][:12],
     }
     curves = binned(at, returns, steps), binned(update, kl, steps), binned(update, iterations, steps)
-    return {"row": row, "curves": dict(zip(("return", "kl", "iterations"), curves))}
+    return {"row": row, "args": same, "curves": dict(zip(("return", "kl", "iterations"), curves))}
 
 
 def read_runs(folder: Path, steps: int, workers: int) -> list[dict]:
-    """All runs in the order of their settings; those that have not come to `steps` have no curves."""
-    folders = sorted(path.parent for path in folder.glob("*/result.json"))
+    """All runs in the order of their settings; those that have not come to `steps` have no curves.
+
+    Raises SystemExit where runs are not of one study.
+    """
+    folders = sorted(path.parent for path in folder.glob("*/updates.csv"))
     with ProcessPoolExecutor(workers) as pool:
         runs = list(pool.map(partial(read_run, steps), folders, chunksize=8))
-    return sorted(runs, key=lambda run: [str(run["row"][key]) for key in ("task", "method", "d_target", "K", "seed")])
+    for run, path in zip(runs, folders):
+        other = next((key for key, value in runs[0]["args"].items() if run["args"].get(key) != value), None)
+        if other is not None:
+            raise SystemExit(f"{path}: has another {other} than {folders[0]}; a report is of one study")
+    settings = [tuple(run["row"][key] for key in SETTING) for run in runs]
+    twice = next((path for path, setting in zip(folders, settings) if settings.count(setting) > 1), None)
+    if twice is not None:
+        raise SystemExit(f"{twice}: is there twice, under another name")
+    return sorted(runs, key=lambda run: [str(run["row"][key]) for key in SETTING])
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -160,15 +199,26 @@ def interquartile_mean(scores: Scores) -> np.ndarray:
     return values[..., cut : values.shape[-1] - cut].mean(-1)
 
 
-def resample(scores: Scores, rng: np.random.Generator) -> Scores:
-    """RESAMPLES times as many runs, drawn with replacement within each task: (seeds,) -> (RESAMPLES, seeds)."""
-    return {task: values[rng.integers(len(values), size=(RESAMPLES, len(values)))] for task, values in scores.items()}
+def resample(scores: Scores, rng: np.random.Generator, stretches: bool = True) -> Scores:
+    """RESAMPLES times as many runs, drawn with replacement within each task: (seeds,) -> (RESAMPLES, seeds).
+
+    Stretched, their means have the variance of means of so many seeds.
+    """
+    drawn = {}
+    for task, values in scores.items():
+        n = len(values)
+        factor = np.sqrt(n / (n - 1)) if stretches and n > 1 else 1.0
+        drawn[task] = values.mean() + factor * (values[rng.integers(n, size=(RESAMPLES, n))] - values.mean())
+    return drawn
 
 
-def bootstrap(statistic: Callable[..., np.ndarray], *groups: Scores) -> tuple[float, float, float]:
+def bootstrap(
+    statistic: Callable[..., np.ndarray], *groups: Scores, stretches: bool = True
+) -> tuple[float, float, float]:
     """A statistic of groups of runs, and its 95% percentile interval by a bootstrap stratified by task."""
     rng = np.random.default_rng(0)
-    low, high = np.percentile(statistic(*(resample(group, rng) for group in groups)), (2.5, 97.5))
+    drawn = statistic(*(resample(group, rng, stretches) for group in groups))
+    low, high = np.percentile(drawn, (2.5, 97.5))
     return float(statistic(*groups)), float(low), float(high)
 
 
@@ -188,11 +238,6 @@ def setting_name(method: str, target: float | None) -> str:
     return METHODS[method] if target is None else f"{METHODS[method]}, d_target = {target}"
 
 
-def published_rows(name: str) -> list[dict[str, str]]:
-    with open(ROOT / "benchmark" / "published" / name, newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def published(name: str) -> dict[tuple[str, str], dict[str, str]]:
     """A published table by its first two columns."""
     rows = published_rows(name)
@@ -200,35 +245,44 @@ def published(name: str) -> dict[tuple[str, str], dict[str, str]]:
 
 
 def cell(theirs: str | None, ours: list[str]) -> str:
-    """Published, then measured."""
-    return " / ".join([theirs or "", *ours]) if any(ours) else theirs or ""
+    """Published, then measured; a dash for what is not published beside what is measured."""
+    return " / ".join([*([] if theirs is None else [theirs or "–"]), *ours]) if any(ours) else theirs or ""
+
+
+def all_tasks(rows: list[dict]) -> list[str]:
+    """The study's tasks that there are, then others."""
+    present = {row["task"] for row in rows}
+    return [task for task in TASKS if task in present] + sorted(present - set(TASKS))
 
 
 def grid_table(
-    rows: list[dict], measures: dict[str, str], theirs: dict, digits: int, settings: list
+    rows: list[dict], columns: list[str], theirs: dict | None, digits: int, settings: list
 ) -> list[list[str]]:
-    """Settings × K: the published number, then means over tasks of the measures' columns."""
-    lines = [["", *(f"K = {k}" for k in KS)]]
+    """Settings × K: the published number, then means over tasks; in brackets their number where it is not all of them."""
+    lines, tasks = [["", *(f"K = {k}" for k in KS)]], len(all_tasks(rows))
     for method, target in settings:
         line = [setting_name(method, target)]
         for k in KS:
             found = select(rows, method, k, target)
-            ours = [f"{mean_of_tasks(by_task(found, column)):.{digits}f}" for column in measures.values() if found]
-            old = theirs.get((METHODS[method], "" if target is None else f"{target:g}"), {}).get(str(k))
-            line.append(cell(old, ours))
+            ours = [f"{mean_of_tasks(by_task(found, column)):.{digits}f}" for column in columns if found]
+            number = len({row["task"] for row in found})
+            key = METHODS[method], "" if target is None else f"{target:g}"
+            old = None if theirs is None else theirs.get(key, {}).get(str(k), "")
+            line.append(cell(old, ours) + (f" ({number} tasks)" if 0 < number < tasks else ""))
         lines.append(line)
     return lines
 
 
-def table_4_4(rows: list[dict], theirs: dict[str, dict[str, str]]) -> list[list[str]]:
+def table_4_4(rows: list[dict], theirs: dict[str, dict[str, str]] | None) -> list[list[str]]:
     """Task × K of plain PPO: published, last episode, mean of the last 50."""
     lines = [["", *(f"K = {k}" for k in KS)]]
-    for task in TASKS:
+    for task in TASKS if theirs is not None else all_tasks(rows):
         line = [task]
         for k in KS:
             found = [row for row in select(rows, "PPO", k) if row["task"] == task]
             means = [np.mean([row[column] for row in found]) for column in ("last_episode", "last_50") if found]
-            line.append(cell(theirs.get(task, {}).get(str(k)), [f"{mean:,.1f}" for mean in means]))
+            old = None if theirs is None else theirs.get(task, {}).get(str(k), "")
+            line.append(cell(old, [f"{mean:,.1f}" for mean in means]))
         lines.append(line)
     return lines
 
@@ -242,7 +296,7 @@ def latex(lines: list[list[str]], caption: str) -> str:
     """The same as a LaTeX table, which needs `booktabs`."""
 
     def escape(text: str) -> str:
-        for old, new in (("%", r"\%"), ("_", r"\_"), ("±", r"$\pm$"), ("d\\_target", r"$d_\mathrm{target}$")):
+        for old, new in (("%", r"\%"), ("&", r"\&"), ("_", r"\_"), ("d\\_target", r"$d_\mathrm{target}$"), ("–", "--")):
             text = text.replace(old, new)
         return text
 
@@ -253,24 +307,24 @@ def latex(lines: list[list[str]], caption: str) -> str:
     return "\n".join([r"\begin{table}", rf"\caption{{{escape(caption)}}}", *inside, r"\end{table}"]) + "\n"
 
 
-def coverage(rows: list[dict], folder_steps: int) -> str:
+def coverage(rows: list[dict], steps: int) -> str:
     """Which part of the grid is there."""
-    cells = len({(row["task"], row["method"], row["d_target"], row["K"]) for row in rows})
-    in_study = [row for row in rows if row["seed"] <= 2]
-    tasks = sorted({row["task"] for row in rows})
-    seeds = sorted({row["seed"] for row in rows})
+    grid = {(task, method, target or "", k) for task in TASKS for method, target in SETTINGS for k in KS}
+    settings = [(row["task"], row["method"], row["d_target"], row["K"]) for row in rows]
+    in_study = sum(setting in grid and row["seed"] <= 2 for setting, row in zip(settings, rows))
+    seeds = ", ".join(map(str, sorted({row["seed"] for row in rows})))
     return (
-        f"{len(rows)} runs of {folder_steps:,} steps, {len(in_study)} of them of the study's 1,210 (seeds 1 and 2): "
-        f"{cells} of 605 settings; {len(tasks)} of 11 tasks ({', '.join(tasks)}); seeds {', '.join(map(str, seeds))}."
+        f"{len(rows)} runs of {steps:,} steps, {in_study} of them of the study's 1,210; {len(grid & set(settings))} of its 605 "
+        f"settings; tasks: {', '.join(all_tasks(rows))}; seeds: {seeds}. Numbers are means over the seeds that a setting has, "
+        "then over tasks."
     )
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # Findings
 # ---------------------------------------------------------------------------------------------------------------------
-@dataclass
-class Finding:
-    """A claim of the study as a difference that it says is positive."""
+class Finding(NamedTuple):
+    """A claim of the study as a number that it says is positive."""
 
     claim: str
     published: str
@@ -282,18 +336,24 @@ def verdict(low: float, high: float) -> str:
     return "confirmed" if low > 0 else "contradicted" if high < 0 else "open"
 
 
-def difference(
-    claim: str, theirs: str, ours: list[dict], others: list[dict], column: str, digits: int = 2
+def tell(
+    claim: str, theirs: str, statistic: Callable[..., np.ndarray], *groups: Scores, margin: float = 0.0, digits: int = 2
 ) -> Finding | None:
-    """The claim that one group's mean over tasks is above the other's, on the tasks that both have."""
-    if not ours or not others or not {row["task"] for row in ours} & {row["task"] for row in others}:
+    """A finding on the tasks that all groups of runs have; None where there is none."""
+    groups = tuple(common(*groups)) if all(groups) else ()
+    if not groups or not groups[0]:
         return None
-    groups = common(by_task(ours, column), by_task(others, column))
-    middle, low, high = bootstrap(lambda a, b: mean_of_tasks(a) - mean_of_tasks(b), *groups)
+    middle, low, high = bootstrap(statistic, *groups)
     seeds = sorted({len(values) for group in groups for values in group.values()})
-    counts = f"{len(groups[0])} tasks, {'–'.join(map(str, sorted({seeds[0], seeds[-1]})))} seeds"
+    counts = f"{len(groups[0])} task{'s' * (len(groups[0]) > 1)}, {' to '.join(map(str, sorted({seeds[0], seeds[-1]})))} seeds"
+    if seeds[0] < 2:
+        return Finding(claim, theirs, f"{middle:+.{digits}f}, {counts}", "open")
     text = f"{middle:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}], {counts}"
-    return Finding(claim, theirs, text, verdict(low, high))
+    return Finding(claim, theirs, text, verdict(low + margin, high + margin))
+
+
+def minus(a: Scores, b: Scores) -> np.ndarray:
+    return mean_of_tasks(a) - mean_of_tasks(b)
 
 
 def spread(split: int) -> Callable[..., np.ndarray]:
@@ -304,16 +364,79 @@ def spread(split: int) -> Callable[..., np.ndarray]:
 
 
 def spreads(rows: list[dict], column: str, method: str, k: int) -> Finding | None:
-    """The claim that the score changes more with K of plain PPO than with d_target at one K."""
-    over_k = {k: by_task(select(rows, "PPO", k), column) for k in KS if select(rows, "PPO", k)}
-    targets = {t: by_task(select(rows, method, k, t), column) for t in TARGETS if select(rows, method, k, t)}
-    if len(over_k) < 2 or len(targets) < 2:
+    """The claim that the score changes more with K of plain PPO than with d_target at one K; as many of both."""
+    targets = [t for t in TARGETS if select(rows, method, k, t)]
+    ks = [k for k in KS if select(rows, "PPO", k)]
+    number = min(len(targets), len(ks))
+    if number < 2:
         return None
-    groups = common(*over_k.values(), *targets.values())
-    middle, low, high = bootstrap(spread(len(over_k)), *groups)
-    text = f"{middle:+.2f} [{low:+.2f}, {high:+.2f}], {len(groups[0])} tasks, {len(over_k)} K, {len(targets)} d_target"
-    claim = f"{METHODS[method]}, K = {k}: d_target matters less than K (range over K less range over d_target)"
-    return Finding(claim, "+", text, verdict(low, high))
+    ks, targets = (
+        [list_[i] for i in np.linspace(0, len(list_) - 1, number).round().astype(int)] for list_ in (ks, targets)
+    )
+    groups = [by_task(select(rows, "PPO", k), column) for k in ks]
+    groups += [by_task(select(rows, method, k, t), column) for t in targets]
+    claim = f"{METHODS[method]} at K = {k}: the range over d_target {tuple(targets)} is below PPO's over K {tuple(ks)}"
+    return tell(claim, "", spread(number), *groups)
+
+
+def published_ner(definition: str, method: str, k: int, target: float | None = None) -> float | None:
+    """A cell of Table 4.2; by the definition as written only plain PPO's is known."""
+    if definition == "as written":
+        return AS_WRITTEN[KS.index(k)] if method == "PPO" else None
+    return float(published("table_4_2.csv")[METHODS[method], "" if target is None else f"{target:g}"][str(k)])
+
+
+def findings(rows: list[dict], definition: str, is_whole: bool) -> list[Finding]:
+    """The claims of section 4.5, of Fig. 4.1 and 4.2, and of Table 4.3, on whatever runs there are."""
+    found: list[Finding | None] = []
+
+    def ner(claim: str, ours: tuple, others: tuple, margin: float = 0.0) -> None:
+        """That the NER of a setting (method, K, d_target) is above another's, or not below it by the margin."""
+        old = [published_ner(definition, *setting) for setting in (ours, others)]
+        theirs = f"{old[0] - old[1]:+.2f}" if is_whole and None not in old else ""
+        groups = [by_task(select(rows, *setting), definition) for setting in (ours, others)]
+        found.append(tell(claim, theirs, minus, *groups, margin=margin))
+
+    def positive(claim: str, part: list[dict], value: Callable[[dict], float]) -> None:
+        scores = by_task([{**row, "value": value(row)} for row in part], "value")
+        found.append(tell(claim, "", mean_of_tasks, scores, digits=1))
+
+    for k in (4, 20, 40, 80):
+        ner(f"PPO: K = 10 above K = {k}", ("PPO", 10), ("PPO", k))
+    for k in (40, 80):
+        groups = [by_task(select(rows, "PPO", each), "log_kl") for each in (k, 10)]
+        found.append(tell(f"PPO: KL divergence at K = {k} above K = 10, powers of ten", "", minus, *groups))
+    early = {method: METHODS[method] for method in ("stop", "rollback")}
+    for method, name in early.items():
+        for k in (20, 40, 80):
+            claim = f"{name} 0.03 at K = {k}: near PPO at K = 10, no more than {MARGIN} below"
+            ner(claim, (method, k, 0.03), ("PPO", 10), margin=MARGIN)
+        for k in (4, 10, 80):
+            ner(f"{name} 0.03 above PPO at the same K = {k}", (method, k, 0.03), ("PPO", k))
+    positive(
+        "KLE-Stop 0.03 at K = 4: iterations fewer than 4, by",
+        select(rows, "stop", 4, 0.03),
+        lambda r: 4 - r["iterations"],
+    )
+    for method, name in early.items():
+        few, many = (by_task(select(rows, method, 80, target), "iterations") for target in (0.015, 0.05))
+        found.append(
+            tell(
+                f"{name} at K = 80: more iterations with d_target = 0.05 than with 0.015",
+                "",
+                minus,
+                many,
+                few,
+                digits=1,
+            )
+        )
+        few, many = (by_task(select(rows, method, k, 0.03), "iterations") for k in (10, 80))
+        found.append(tell(f"{name} 0.03: more iterations at K = 80 than at K = 10", "", minus, many, few, digits=1))
+        late = select(rows, method, 80, 0.03)
+        claim = f"{name} 0.03 at K = 80: more iterations in the last quarter of these steps than in the first"
+        positive(claim, late, lambda r: r["iterations_last_quarter"] - r["iterations_first_quarter"])
+    found += [spreads(rows, definition, method, k) for method in early for k in (80, 10)]
+    return [finding for finding in found if finding is not None]
 
 
 def wins(rows: list[dict], column: str, k: int) -> str:
@@ -325,47 +448,25 @@ def wins(rows: list[dict], column: str, k: int) -> str:
     return f"{sum(stop[task].mean() < plain[task].mean() for task in stop)} of {len(stop)}"
 
 
-def best_k(rows: list[dict], column: str) -> int:
-    """The K at which plain PPO has the highest mean over tasks."""
-    means = {k: mean_of_tasks(by_task(select(rows, "PPO", k), column)) for k in KS if select(rows, "PPO", k)}
-    return max(means, key=means.get)
-
-
-def findings(rows: list[dict], column: str) -> list[Finding]:
-    """The claims of section 4.5, and of Fig. 4.1 and 4.2, on whatever runs there are."""
-    plain = {k: select(rows, "PPO", k) for k in KS}
-    best = best_k(rows, column)
-    found = [
-        difference("PPO: K = 10 above K = 4", "+0.11", plain[10], plain[4], column),
-        difference("PPO: K = 10 above K = 20", "+0.13", plain[10], plain[20], column),
-        difference("PPO: K = 10 above K = 80 (unlearning)", "+0.34", plain[10], plain[80], column),
-        difference("KL divergence: PPO at K = 80 above K = 10", "+ (Fig. 4.1c)", plain[80], plain[10], "mean_kl", 3),
-    ]
-    for method, old in (("stop", ("+0.36", "+0.02")), ("rollback", ("+0.38", "+0.04"))):
-        ours, name = select(rows, method, 80, 0.03), METHODS[method]
-        found.append(difference(f"K = 80: {name} 0.03 above PPO", old[0], ours, plain[80], column))
-        claim = f"{name} 0.03 at K = 80 above PPO at its best K ({best})"
-        found.append(difference(claim, old[1], ours, plain[best], column))
-    for method in ("stop", "rollback"):
-        ours = select(rows, method, 10, 0.03)
-        old = "+0.07" if method == "stop" else "+0.05"
-        found.append(difference(f"K = 10: {METHODS[method]} 0.03 above PPO", old, ours, plain[10], column))
-    stop = {k: select(rows, "stop", k, 0.03) for k in KS}
-    found.append(difference("K = 4: KLE-Stop 0.03 above PPO", "+0.13", stop[4], plain[4], column))
-    late = [{**row, "late": row["iterations_last_quarter"] - row["iterations_first_quarter"]} for row in stop[80]]
-    none = [{**row, "late": 0.0} for row in late]
-    claim = "KLE-Stop 0.03, K = 80: more iterations in the last quarter than in the first"
-    found.append(difference(claim, "+ (Fig. 4.1d)", late, none, "late", 1))
-    found += [spreads(rows, column, method, k) for method in ("stop", "rollback") for k in (80, 10)]
-    return [finding for finding in found if finding is not None]
-
-
-def findings_table(rows: list[dict], column: str) -> list[list[str]]:
-    lines = [["claim", "published", "measured, 95%", "verdict"]]
-    lines += [[each.claim, each.published, each.measured, each.verdict] for each in findings(rows, column)]
+def findings_table(rows: list[dict], definition: str, is_whole: bool) -> list[list[str]]:
+    lines = [["claim", "published", "measured, 95%", "verdict"], *map(list, findings(rows, definition, is_whole))]
     for k, old in ((10, "3 of 11"), (4, "")):
-        if wins(rows, column, k):
-            lines.append([f"K = {k}: tasks on which KLE-Stop 0.03 is below PPO", old, wins(rows, column, k), ""])
+        if wins(rows, definition, k):
+            theirs = old if is_whole else ""
+            lines.append([f"K = {k}: tasks on which KLE-Stop 0.03 is below PPO", theirs, wins(rows, definition, k), ""])
+    for k, old in ((4, "50.63"), (10, "72.58"), (80, "20.08")):
+        scores = by_task(select(rows, "PPO", k), definition)
+        if scores:
+            measured = f"{100 * mean_of_tasks(scores):.2f}"
+            lines.append([f"PPO at K = {k}: % of the best (section 4.5.1)", old if is_whole else "", measured, ""])
+    means = [
+        100 * mean_of_tasks(by_task(select(rows, method, 80, target), definition))
+        for method, target in SETTINGS[1:]
+        if select(rows, method, 80, target)
+    ]
+    if means:
+        measured, old = f"{min(means):.2f} to {max(means):.2f}, {len(means)} settings", "55.84 to 76.89"
+        lines.append(["early stops at K = 80: % of the best (section 4.5.3)", old if is_whole else "", measured, ""])
     return lines
 
 
@@ -376,37 +477,34 @@ def iqm_table(rows: list[dict], column: str) -> list[list[str]]:
         line = [setting_name(method, target)]
         for k in KS:
             scores = by_task(select(rows, method, k, target), column)
-            middle, low, high = bootstrap(interquartile_mean, scores) if scores else (0, 0, 0)
+            middle, low, high = bootstrap(interquartile_mean, scores, stretches=False) if scores else (0, 0, 0)
             line.append(f"{middle:.2f} [{low:.2f}, {high:.2f}]" if scores else "")
         lines.append(line)
     return lines
 
 
+def study_iterations() -> list[float]:
+    """Iterations per update of the study's 55 settings of a task: K for plain PPO, else Table 4.3."""
+    early = [float(row[str(k)]) for row in published_rows("table_4_3.csv") for k in KS]
+    return [*map(float, KS), *early]
+
+
 def cost_table(rows: list[dict]) -> list[list[str]]:
-    """Steps per second by task and K, and what 1,210 runs of 2,000,000 steps take on one core at those speeds."""
-    lines = [["task", *(f"K = {k}" for k in KS), "core-hours of its 110 runs"]]
+    """What 1,210 runs of 2,000,000 steps take on one core: seconds per step are a + b · iterations, fitted for each task."""
+    lines = [["task", "runs", "a, µs", "b, µs", "steps/s at K = 10", "steps/s at K = 80", "core-hours of its 110 runs"]]
     total, known = 0.0, 0
-    for task in TASKS:
-        own = [row for row in rows if row["task"] == task]
-        speeds = {k: [row["steps_per_second"] for row in own if row["K"] == k] for k in KS}
-        line = [task, *(f"{np.median(speeds[k]):,.0f}" if speeds[k] else "" for k in KS)]
-        if all(speeds.values()):
-            hours = sum(22 * 2e6 / speed for speed in (cell_speed(own, k) for k in KS)) / 3600
-            total, known = total + hours, known + 1
-            line.append(f"{hours:.1f}")
-        else:
-            line.append("")
-        lines.append(line)
-    lines.append([f"sum of {known} tasks", *[""] * len(KS), f"{total:.1f}"])
+    for task in all_tasks(rows):
+        own = [row for row in rows if row["task"] == task and "seconds_per_step" in row]
+        iterations = np.array([row["all_iterations"] for row in own])
+        if len(own) < 2 or np.ptp(iterations) < 1:
+            continue
+        b, a = np.polyfit(iterations, [row["seconds_per_step"] for row in own], 1)
+        hours = 2 * 2e6 * sum(a + b * each for each in study_iterations()) / 3600
+        total, known = total + hours, known + 1
+        speeds = [f"{1 / (a + b * k):,.0f}" for k in (10, 80)]
+        lines.append([task, str(len(own)), f"{1e6 * a:.1f}", f"{1e6 * b:.2f}", *speeds, f"{hours:.1f}"])
+    lines.append([f"sum of {known} of 11 tasks", *[""] * 5, f"{total:.1f}"])
     return lines
-
-
-def cell_speed(rows: list[dict], k: int) -> float:
-    """Harmonic mean of the steps per second at a K, in which plain PPO counts 1 and each early stop 5, as in the study."""
-    speeds = {method: [row["steps_per_second"] for row in select(rows, method, k)] for method in METHODS}
-    weights = {method: 1 if method == "PPO" else 5 for method, found in speeds.items() if found}
-    seconds = sum(weight / float(np.median(speeds[method])) for method, weight in weights.items())
-    return sum(weights.values()) / seconds
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -419,6 +517,12 @@ def new_figure(title: str, rows: int, columns: int, width: float, height: float)
         each.spines[["top", "right"]].set_visible(False)
     figure.suptitle(title)
     return figure, axes
+
+
+def legend(axes, size: str) -> None:
+    """A legend, where there is something to name."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=size)
 
 
 def score_over_k(axes, rows: list[dict], column: str) -> None:
@@ -440,14 +544,14 @@ def score_over_k(axes, rows: list[dict], column: str) -> None:
                 for k in ks
             ]
             middle = [mean_of_tasks(by_task(select(rows, method, k, 0.03), column)) for k in ks]
-            low, high = [min(each) for each in means], [max(each) for each in means]
+            low, high = ([f(each) if len(each) > 1 else np.nan for each in means] for f in (min, max))
         label = METHODS[method] + ("" if method == "PPO" else " 0.03")
         axes.plot(ks, middle, "o-", color=COLOURS[method], markersize=4, label=label)
         axes.fill_between(ks, low, high, color=COLOURS[method], alpha=0.15, linewidth=0)
     axes.set(xscale="log", xlabel="K", ylabel="NER", title="(a) all tasks")
     axes.set_xticks(KS, map(str, KS))
     axes.minorticks_off()
-    axes.legend(fontsize="small")
+    legend(axes, "small")
 
 
 def curve(axes, runs: list[dict], name: str, steps: int, **style) -> None:
@@ -476,36 +580,35 @@ def figure_4_1(runs: list[dict], column: str, steps: int) -> Figure:
         panel.set(title=f"{title}, HalfCheetah-v2", xlabel="steps, millions")
         if name == "kl":
             panel.set_yscale("log")
-    axes[0, 1].legend(fontsize="x-small")
+    legend(axes[0, 1], "x-small")
     return figure
 
 
 def figure_4_2(rows: list[dict], column: str) -> Figure:
-    """NER of every setting; bars are means over tasks and K, dots each K, the least on the left."""
-    figure, axes = new_figure(
-        "Fig. 4.2: K of plain PPO beside d_target of the early stops (dots: K = 4 to 80 from the left)", 1, 3, 12, 3.6
-    )
+    """NER of every setting; bars are means over the K that all d_target have, dots each K, the least on the left."""
+    title = "Fig. 4.2: K of plain PPO beside d_target of the early stops (dots: each K, from the left)"
+    figure, axes = new_figure(title, 1, 3, 12, 3.6)
     axes[0, 0].set_ylabel("NER")
     for panel, method in zip(axes[0], METHODS):
-        settings = [(f"K = {k}", select(rows, method, k)) for k in KS]
-        if method != "PPO":
-            settings = [(f"{target:g}", select(rows, method, None, target)) for target in TARGETS]
-        for x, (_, found) in enumerate(settings):
-            if found:
-                middle, low, high = bootstrap(mean_of_tasks, by_task(found, column))
-                panel.bar(x, middle, color=COLOURS[method], alpha=0.6)
-                panel.errorbar(x, middle, [[middle - low], [high - middle]], color="black", capsize=3)
-                for k in sorted({row["K"] for row in found}) if method != "PPO" else []:
-                    score = mean_of_tasks(by_task([row for row in found if row["K"] == k], column))
-                    panel.plot(x + (KS.index(k) - 2) * 0.15, score, "o", color="black", markersize=2.5)
-        panel.set_xticks(range(len(settings)), [name for name, _ in settings])
+        targets = [None] if method == "PPO" else [t for t in TARGETS if select(rows, method, None, t)]
+        ks = [k for k in KS if targets and all(select(rows, method, k, target) for target in targets)]
+        bars = [[(None, k)] for k in ks] if method == "PPO" else [[(target, k) for k in ks] for target in targets]
+        for x, bar in enumerate(bars if ks else []):
+            groups = [by_task(select(rows, method, k, target), column) for target, k in bar]
+            middle, low, high = bootstrap(lambda *each: np.mean([*map(mean_of_tasks, each)], 0), *groups)
+            panel.bar(x, middle, color=COLOURS[method], alpha=0.6)
+            panel.errorbar(x, middle, [[max(0, middle - low)], [max(0, high - middle)]], color="black", capsize=3)
+            for (_, k), group in zip(bar if method != "PPO" else [], groups):
+                panel.plot(x + (KS.index(k) - 2) * 0.15, mean_of_tasks(group), "o", color="black", markersize=2.5)
+        names = [f"K = {k}" for k in ks] if method == "PPO" else [f"{target:g}" for target in targets]
+        panel.set_xticks(range(len(names)), names)
         panel.set(title=METHODS[method] + ("" if method == "PPO" else ", by d_target"), ylim=(0, 1))
     return figure
 
 
-def task_figures(runs: list[dict], steps: int) -> list[Figure]:
-    """Fig. 4.3 to 4.6: three tasks each, one a column: NER over K, return over K, KL divergence and iterations over K."""
-    figures = []
+def task_figures(runs: list[dict], steps: int) -> dict[str, Figure]:
+    """Fig. 4.3 to 4.6: three tasks each, one a column: NER, return, KL divergence and iterations over K."""
+    figures = {}
     rows = [run["row"] for run in runs]
     measures = {"as written": "NER", "last_50": "return", "mean_kl": "KL divergence", "iterations": "iterations"}
     for number, begin in enumerate(range(0, len(TASKS), 3)):
@@ -532,14 +635,14 @@ def task_figures(runs: list[dict], steps: int) -> list[Figure]:
                     panel.set_yscale("log")
             axes[0, column].set_title(task)
             axes[-1, column].set_xlabel("K")
-        axes[0, 0].legend(fontsize="x-small")
-        figures.append(figure)
+        legend(axes[0, 0], "x-small")
+        figures[f"fig_4_{3 + number}"] = figure
     return figures
 
 
 def curves_figure(runs: list[dict], steps: int) -> Figure:
     """Learning curves of each task at K = 10 and K = 80."""
-    tasks = [task for task in TASKS if any(run["row"]["task"] == task for run in runs)]
+    tasks = all_tasks([run["row"] for run in runs])
     columns = min(4, len(tasks))
     lines = -(-len(tasks) // columns)
     figure, axes = new_figure(
@@ -555,7 +658,7 @@ def curves_figure(runs: list[dict], steps: int) -> Figure:
         panel.set_title(task)
     for panel in axes.flat[len(tasks) :]:
         panel.set_visible(False)
-    axes.flat[0].legend(fontsize="x-small")
+    legend(axes.flat[0], "x-small")
     figure.supxlabel("steps, millions")
     return figure
 
@@ -597,7 +700,7 @@ def profiles(rows: list[dict], column: str) -> Figure:
                 panel.plot(levels, profile(scores), color=COLOURS[method], label=METHODS[method])
                 panel.fill_between(levels, low, high, color=COLOURS[method], alpha=0.15, linewidth=0)
         panel.set(title=f"K = {k}", xlabel="NER", ylim=(0, 1))
-    axes[0, 0].legend(fontsize="small")
+    legend(axes[0, 0], "small")
     return figure
 
 
@@ -606,40 +709,38 @@ def profiles(rows: list[dict], column: str) -> Figure:
 # ---------------------------------------------------------------------------------------------------------------------
 def provenance(rows: list[dict], args: Args) -> str:
     """What the results rest on."""
-    made_at = sorted({commit_of("ppo_continuous_kle", digest) for digest in {row["script_sha256"] for row in rows}})
-    hours = sum(row["training_seconds"] for row in rows) / 3600
+    digests = {row["script_sha256"] for row in rows} - {""}
+    made_at = sorted({commit_of("ppo_continuous_kle", digest) for digest in digests})
+    hours = sum(row["steps"] * row["seconds_per_step"] for row in rows if "seconds_per_step" in row) / 3600
     return (
         f"`benchmark/ppo_kle.sh`, ppo_continuous_kle.py at {', '.join(made_at)}; `python benchmark/report.py --steps "
-        f"{args.steps}` at {commit()}. {hours:.1f} core-hours of training, one thread each.\n\n"
-        f"{coverage(rows, args.steps)}\n\n"
+        f"{args.steps}` at {commit()}. {hours:.1f} core-hours of training, one thread each.\n\n{coverage(rows, args.steps)}\n\n"
     )
 
 
-def tables(rows: list[dict], all_rows: list[dict], is_whole: bool) -> dict[str, list[list[str]]]:
-    """All tables by their captions; published numbers, which are of 2,000,000 steps, only beside whole runs.
+def tables(rows: list[dict], all_rows: list[dict], steps: int) -> dict[str, list[list[str]]]:
+    """All tables by their captions; published numbers, which are of 2,000,000 steps, only beside runs of as many.
 
     Speeds are those of `all_rows`, of runs that have not come so far too.
     """
-    ner, iterations, returns = ({}, {}, {})
+    is_whole = steps == 2_000_000
+    ner, iterations, returns = None, None, None
     if is_whole:
         ner, iterations = published("table_4_2.csv"), published("table_4_3.csv")
         returns = {row["task"]: row for row in published_rows("table_4_4.csv")}
-    old = "published / " if is_whole else ""
-    both = dict.fromkeys(SCORES)
-    early = {"iterations": "iterations", "first": "iterations_500k"}
-    written = "as written"
-    return {
-        f"Table 4.2: NER, {old}as tabulated / as written": grid_table(rows, {d: d for d in both}, ner, 2, SETTINGS),
-        f"Table 4.3: iterations per update, {old}whole run / first 500,000 steps": grid_table(
-            rows, early, iterations, 2, SETTINGS[1:]
-        ),
-        f"Table 4.4: return of plain PPO, {old}last episode / last 50 episodes": table_4_4(rows, returns),
-        "Findings of section 4.5, by the NER as written": findings_table(rows, written),
-        "Interquartile mean of the NER as written, with its 95% interval": iqm_table(rows, written),
-        "Cost: median steps per second of all runs, also shorter ones, one thread; core-hours of 2,000,000 steps": cost_table(
-            all_rows
-        ),
+    old, of = ("published / ", "") if is_whole else ("", f", first {steps:,} steps")
+    spans = ["iterations", "iterations_500k"] if steps > 500_000 else ["iterations"]
+    names = "whole run / first 500,000 steps" if steps > 500_000 else f"first {steps:,} steps"
+    made = {
+        f"Table 4.2: NER{of}, {old}as tabulated / as written": grid_table(rows, list(SCORES), ner, 2, SETTINGS),
+        f"Table 4.3: iterations per update, {old}{names}": grid_table(rows, spans, iterations, 2, SETTINGS[1:]),
+        f"Table 4.4: return of plain PPO{of}, {old}last episode / last 50 episodes": table_4_4(rows, returns),
     }
+    for definition in SCORES:
+        made[f"Findings, NER {definition}{of}"] = findings_table(rows, definition, is_whole)
+    made[f"Interquartile mean of the NER as written{of}, with its 95% interval"] = iqm_table(rows, "as written")
+    made["Cost of the study on one core"] = cost_table(all_rows)
+    return made
 
 
 def main(args: Args) -> None:
@@ -650,15 +751,15 @@ def main(args: Args) -> None:
     out = args.out or ROOT / "benchmark" / "results" / "ppo_kle" / f"{args.steps}"
     out.mkdir(parents=True, exist_ok=True)
     rows = [run["row"] for run in runs]
-    write_csv(out / "runs.csv", rows)
+    write_csv(out / "runs.csv", [{key: row.get(key, "") for key in rows[0] | {"seconds_per_step": ""}} for row in rows])
     for definition in SCORES:
         normalise(rows, definition)
-    made = tables(rows, [run["row"] for run in found], args.steps == 2_000_000)
+    made = tables(rows, [run["row"] for run in found], args.steps)
     text = provenance(rows, args) + "\n".join(f"## {name}\n\n{markdown(lines)}" for name, lines in made.items())
     (out / "tables.md").write_text(text)
     (out / "tables.tex").write_text("\n".join(latex(lines, name) for name, lines in made.items()))
     figures = {"fig_4_1": figure_4_1(runs, "as written", args.steps), "fig_4_2": figure_4_2(rows, "as written")}
-    figures |= {f"fig_4_{3 + i}": figure for i, figure in enumerate(task_figures(runs, args.steps))}
+    figures |= task_figures(runs, args.steps)
     figures |= {"learning_curves": curves_figure(runs, args.steps), "heat_map": heat_map(rows, "as written")}
     figures["profiles"] = profiles(rows, "as written")
     for name, figure in figures.items():

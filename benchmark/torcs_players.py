@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import safetensors.torch
 import tyro
-from apple_players import ROOT, commit, published_table
-from apple_report import write_csv
+from common import ROOT, commit, published_table, write_csv
 
 from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import gail_hybrid as gail

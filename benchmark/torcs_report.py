@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from apple_players import ROOT, commit, published_table
-from apple_report import commit_of, interval, with_interval, write_csv
+from apple_report import interval, with_interval
+from common import ROOT, commit, commit_of, published_table, write_csv
 from matplotlib.figure import Figure
 
 from cleanrl_thesis import gail_hybrid as gail

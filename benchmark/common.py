@@ -1,0 +1,43 @@
+"""What the reports share: published tables, results as CSV, and the commits that results rest on."""
+
+import csv
+import hashlib
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def published_rows(name: str) -> list[dict[str, str]]:
+    """A published table."""
+    with open(ROOT / "benchmark" / "published" / name, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def published_table(name: str) -> dict[str, dict[str, str]]:
+    """The rows of a published table by agent."""
+    return {row["agent"]: row for row in published_rows(name)}
+
+
+def write_csv(path: Path, rows: list[dict]) -> None:
+    """Write rows that have the same columns."""
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout
+
+
+def commit() -> str:
+    return git("describe", "--always", "--dirty").strip()
+
+
+def commit_of(script: str, digest: str) -> str:
+    """The newest commit whose script has this checksum."""
+    path = f"cleanrl_thesis/{script}.py"
+    commits = git("log", "--format=%h", "--", path).split()
+    found = (c for c in commits if hashlib.sha256(git("show", f"{c}:{path}").encode()).hexdigest().startswith(digest))
+    return next(found, "not recorded")
