@@ -131,7 +131,7 @@ def ddpg_contenders(work: Work) -> dict:
 def trpo_contenders(work: Work, demos: Path) -> dict:
     """Every step of a batch for the Fisher matrix, as the peer, and a round of the discriminator after each batch."""
     flags = ["--env-id", work.env_id, "--num-envs", 1, "--num-steps", 2048, "--alpha", 1, "--demos-rl", demos]
-    flags += ["--fisher-every", 1, "--g-steps", 1, "--total-timesteps", work.steps]
+    flags += ["--fisher-every", 1, "--g-steps", 1, "--bc-epochs", 0, "--total-timesteps", work.steps]
     return {
         "sb3-contrib, TRPO": lambda: time_peer("sb3_trpo.py", work.env_id, work.steps // 2048),
         "gail_hybrid.py, GAIL": lambda: time_ours("gail_hybrid.py", *flags),

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The driving task: DDPG experts (45 minutes each), the first of which the students learn from; hybrids over α (4 minutes
-# each), those of α = 0.5 without the discriminator's penalty, and clones of the drivers' actions alone: the runs behind
-# benchmark/results/torcs/. Can be sent again after every stop. An expert takes 0.9 GB of disk.
+# each), those of α = 0.5 without the discriminator's penalty or without the start by cloning, and clones of the drivers'
+# actions alone: the runs behind benchmark/results/torcs/. Can be sent again after every stop. An expert takes 0.9 GB of disk.
 #   benchmark/torcs_alpha.sh
 #   SEEDS="1" ALPHAS="0.5" WORKERS=1 benchmark/torcs_alpha.sh
 set -euo pipefail
@@ -27,6 +27,9 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
   for alpha in $ALPHAS; do
     for seed in $SEEDS; do student "$seed" "$alpha" "alpha$alpha"; done
   done
-  for seed in $SEEDS; do student "$seed" 0.5 penalty0_alpha0.5 --d-grad-penalty 0; done
+  for seed in $SEEDS; do
+    student "$seed" 0.5 penalty0_alpha0.5 --d-grad-penalty 0
+    student "$seed" 0.5 bc0_alpha0.5 --bc-epochs 0
+  done
 } | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/gail_hybrid.py --save-model --save-demos 20 --eval-episodes 100 --resume
 "$PYTHON" benchmark/torcs_report.py --runs "$RUNS"

@@ -102,6 +102,7 @@ def table_2_3(rows: list[dict]) -> str:
         "other DDPG experts": [("evaluation", "other")],
         "hybrid, α = 0.5": [(mode, "alpha0.5") for mode in MODES],
         "the same without penalty": [(mode, "penalty0_alpha0.5") for mode in MODES],
+        "the same without cloning first": [(mode, "bc0_alpha0.5") for mode in MODES],
         "human": [("demonstrations", "human")],
         "GAIL, α = 0": [(mode, "alpha0.0") for mode in MODES],
         "GAIL on DDPG, α = 1": [(mode, "alpha1.0") for mode in MODES],

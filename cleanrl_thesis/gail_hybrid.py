@@ -22,7 +22,8 @@ agent, and its score stands to the DDPG experts' as in Table 2.3. `--demos-human
 | updates of the policy for one of the discriminator | 3 | the study's code |
 | batch | 64 actions in each of 16 environments | ours; the study's code has 1,024 in one for GAIL, 512 for the hybrid |
 | an action is held, while driving | for 5 steps, 0.1 s, as by `ddpg_torcs_like.py` | ours; the study's code acts in each step |
-| penalty on the discriminator's gradient | 1 (`--d-grad-penalty 0`: Eq. 2.3.1 alone) | ours, after Gulrajani et al. 2017 |
+| penalty on the discriminator's gradient | 10 (`--d-grad-penalty 0`: Eq. 2.3.1 alone) | ours; the number is that of Gulrajani et al. 2017 |
+| start by behaviour cloning | 20 passes (`--bc-epochs 0`: none) | an option of the study's code |
 | Fisher matrix | from a fifth of a batch | OpenAI Baselines' |
 | actions that the discriminator sees | within the bounds | ours; the study's code shows them as sampled |
 | CG iterations, damping; γ, λ; passes over the value function, rate; entropies | 10, 0.1; 0.995, 0.97; 5, 1e-3; 0, 1e-3 | the study's code |
@@ -175,12 +176,12 @@ class Args:
     """weight of the policy's entropy"""
     d_ent_coef: float = 1e-3
     """weight of the discriminator's entropy"""
-    d_grad_penalty: float = 1.0
+    d_grad_penalty: float = 10.0
     """weight of the penalty on the discriminator's gradient between student and experts; 0: Eq. 2.3.1 as it stands"""
     reward_form: Literal["positive", "signed"] = "positive"
     """positive: −log D (Eq. 2.3.1), with which it pays to survive; signed: log(1 − D) − log D, with which it need not"""
-    bc_epochs: int = 0
-    """passes over the human's demonstrations in which the policy first learns actions (behaviour cloning); with
+    bc_epochs: int = 20
+    """passes over the human's demonstrations in which the policy first learns actions (behaviour cloning); 0: none; with
     `--total-timesteps 0` that is all: both experts' actions are mixed into one mean, as section 2.3.2 warns against"""
     hidden_size: int = 100
     """units in each of the two hidden layers of all networks"""
