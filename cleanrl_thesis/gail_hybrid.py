@@ -262,7 +262,7 @@ def complete_args(args: Args) -> Args:
     )
     args.batch_size = args.num_envs * args.num_steps * args.frame_skip
     args.num_iterations = args.total_timesteps // args.batch_size
-    allowed = f"must be at least one batch, {args.batch_size} steps, or 0 with --bc-epochs"
+    allowed = f"must be at least one batch, {args.batch_size} steps, or 0 with --bc-epochs above 0"
     clones = args.total_timesteps == 0 and args.bc_epochs > 0
     require(args.num_iterations >= 1 or clones, "--total-timesteps", args.total_timesteps, allowed)
     actions = args.num_envs * args.num_steps

@@ -25,21 +25,8 @@ SMALL_DDPG = [
     *("--keep-best-every", 2_000),
 ]
 SMALL_GAIL = [
-    *(
-        "--total-timesteps",
-        5_120,
-        "--num-envs",
-        4,
-        "--num-steps",
-        32,
-        "--frame-skip",
-        2,
-        "--human-episodes",
-        2,
-        "--hidden-size",
-        16,
-    ),
-    *("--checkpoint-interval", 1, "--eval-episodes", 2),
+    *("--total-timesteps", 5_120, "--num-envs", 4, "--num-steps", 32, "--frame-skip", 2, "--human-episodes", 2),
+    *("--hidden-size", 16, "--bc-epochs", 1, "--checkpoint-interval", 1, "--eval-episodes", 2),
 ]
 RECORDS = ("episodes.csv", "updates.csv", "evaluation.json")
 
@@ -194,7 +181,7 @@ def test_a_student_of_another_task(tmp_path):
 
 def test_mixing_the_actions_alone(expert, tmp_path):
     """Behaviour cloning without a step of GAIL; sent again, it is done."""
-    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--bc-epochs", 1, "--total-timesteps", 0, "--run-dir", "run"]
+    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--total-timesteps", 0, "--run-dir", "run"]
     run(*flags, cwd=tmp_path, script=GAIL)
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["complete"] and result["global_step"] == 0 and result["steps_per_second"] is None
@@ -219,7 +206,7 @@ def test_recorded_demonstrations_are_those_that_are_learned_from(student, expert
 
 def test_the_report_takes_whatever_is_done(expert, student, tmp_path):
     """Of one seed: both experts, the hybrid, a clone; what is not finished is left out."""
-    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--bc-epochs", 1, "--total-timesteps", 0]
+    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--total-timesteps", 0]
     run(*flags, "--run-dir", tmp_path / "runs" / "mix_alpha0.5_seed1", cwd=tmp_path, script=GAIL)
     shutil.copytree(expert, tmp_path / "runs" / "expert_seed1")
     shutil.copytree(expert, tmp_path / "runs" / "expert_seed2")

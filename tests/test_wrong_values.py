@@ -58,7 +58,7 @@ BAD_GAIL = [
     (["--alpha", 0, "--d-grad-penalty", "nan"], ["--d-grad-penalty", "nan"]),
     (["--alpha", 0, "--num-envs", 1, "--num-steps", 8, "--d-steps", 9], ["--d-steps", "9", "8"]),
     (["--alpha", 0, "--total-timesteps", 100], ["--total-timesteps", "100", "5120"]),
-    (["--alpha", 0, "--total-timesteps", 0], ["--total-timesteps", "0", "--bc-epochs"]),
+    (["--alpha", 0, "--bc-epochs", 0, "--total-timesteps", 0], ["--total-timesteps", "0", "--bc-epochs"]),
     (["--alpha", 0, "--reward-form", "odd"], ["--reward-form", "odd"]),
     (["--alpha", 1, "--demos-rl", "no/such/folder"], ["--demos-rl", "no/such/folder", "manifest"]),
     (["--alpha", 0, "--demos-human", "no/such/folder"], ["--demos-human", "no/such/folder", "manifest"]),
