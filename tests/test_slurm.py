@@ -85,6 +85,10 @@ class Cluster:
         (folder / "state").mkdir()
         text = CONFIGURATION.format(folder=folder, ports=free_ports(3), host=socket.gethostname().split(".")[0])
         (folder / "slurm.conf").write_text(text)
+
+    def begin(self) -> None:
+        """Start all daemons and wait for them. Raises AssertionError where they do not come up."""
+        folder = self.folder
         key = folder / "munge.key"
         key.write_bytes(os.urandom(128))
         key.chmod(0o400)
@@ -109,17 +113,20 @@ class Cluster:
         return subprocess.run(words, env=self.environment, capture_output=True, text=True).stdout
 
     def kill_node(self, node: str) -> None:
-        """As when its power goes: daemon, step managers and jobs at once."""
+        """As when its power goes: daemon, step managers and then the jobs, which nobody is left to report on."""
         self.daemons.pop(node).kill()
+        jobs, steps = [], set()
         for path in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 environment = (path / "environ").read_bytes().split(b"\0")
                 if f"SLURMD_NODENAME={node}".encode() in environment and self.is_own(environment):
+                    jobs.append(int(path.name))
                     parent = int((path / "stat").read_text().rpartition(")")[2].split()[1])
-                    is_step = Path(f"/proc/{parent}/comm").read_text().startswith("slurmstepd")
-                    os.kill(int(path.name), signal.SIGKILL)
-                    if is_step:
-                        os.kill(parent, signal.SIGKILL)
+                    if Path(f"/proc/{parent}/comm").read_text().startswith("slurmstepd"):
+                        steps.add(parent)
+        for process in (*steps, *jobs):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
 
     def is_own(self, environment: list[bytes]) -> bool:
         return f"SLURM_CONF={self.folder / 'slurm.conf'}".encode() in environment
@@ -135,9 +142,12 @@ class Cluster:
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("slurm")
-    cluster = Cluster(folder)
+    cluster = Cluster(tmp_path_factory.mktemp("slurm"))
     try:
+        try:
+            cluster.begin()
+        except AssertionError as error:
+            pytest.skip(f"Slurm does not start here: {error}")
         yield cluster
     finally:
         cluster.stop()
