@@ -2,7 +2,7 @@
 # The study of chapter 4: 11 tasks × K {4, 10, 20, 40, 80} × {plain, KLE-Stop and KLE-Rollback at five d_target} × 2 seeds,
 # 1,210 runs. Can be sent again after every stop; stages share their runs.
 #   benchmark/ppo_kle.sh                                                         all 1,210, 2,000,000 steps each
-#   STAGES="first targets seeds others" STOP_AT=500000 benchmark/ppo_kle.sh      the 459 runs of benchmark/results/ppo_kle
+#   STAGES="first targets seeds others" STOP_AT=500000 benchmark/ppo_kle.sh      459 of them and more seeds, 500,000 steps
 #   WORKERS=200 SLURM=benchmark/slurm_template.sh benchmark/ppo_kle.sh           on a cluster, 200 runs at a time
 set -euo pipefail
 cd "$(dirname "$0")/.."
