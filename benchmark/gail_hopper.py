@@ -32,7 +32,7 @@ class Args:
 
 EXPERT = ["--total-timesteps", 1_000_000, "--compile", "--save-demos", 50, "--eval-episodes", 50]
 STUDENT = ["--alpha", 1, "--num-envs", 1, "--num-steps", 1_024, "--total-timesteps", 2_000_000, "--eval-episodes", 50]
-STUDENT += ["--d-grad-penalty", 1, "--bc-epochs", 0]
+STUDENT += ["--d-grad-penalty", 1, "--bc-epochs", 0, "--no-anneal-kl"]
 
 
 def run(script: str, *flags: object) -> None:

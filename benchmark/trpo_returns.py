@@ -70,7 +70,7 @@ def last_returns(args: Args, seed: int) -> list[float]:
         players.rewards = []
         rollout = gail.collect(agent, players, space, settings, rng)
         batch = gail.make_batch(agent, rollout, np.array(players.rewards, np.float32)[:, None], space, settings, device)
-        gail.trpo_step(policy, batch, settings)
+        gail.trpo_step(policy, batch, settings.max_kl, settings)
         gail.update_values(agent, optimizer, batch, settings)
         returns += [episodic_return for _, episodic_return, _ in rollout.episodes]
     return returns[-50:]

@@ -18,6 +18,7 @@ agent, and its score stands to the DDPG experts' as in Table 2.3. `--demos-human
 |---|---|---|
 | steps | 5,000,000 for GAIL (α = 0), else 7,500,000 | section 2.4.3 |
 | KL bound, discriminator's learning rate | 0.01, 1e-3 | section 2.4.3 |
+| the bound is annealed to 1% | on | ours; the study's code keeps it, and its students still crash at the end |
 | networks | two layers of 100 with tanh, for policy, values and discriminator | the study's code |
 | updates of the policy for one of the discriminator | 3 | the study's code |
 | batch | 64 actions in each of 16 environments | ours; the study's code has 1,024 in one for GAIL, 512 for the hybrid |
@@ -160,6 +161,8 @@ class Args:
     """steps per update of the value function (Baselines)"""
     max_kl: float = 0.01
     """bound on the mean KL divergence of an update (section 2.4.3)"""
+    anneal_kl: bool = True
+    """anneal the bound linearly to a hundredth; off: constant (the study's code)"""
     kl_slack: float = 1.5
     """the line search takes a step whose KL divergence is up to this many bounds (Baselines)"""
     cg_iterations: int = 10
@@ -1447,7 +1450,13 @@ def surrogate(policy: PolicyVector, vector: torch.Tensor, batch: Batch, old_logp
 
 
 @torch.no_grad()
-def trpo_step(policy: PolicyVector, batch: Batch, args: Args) -> dict[str, float]:
+def kl_bound(iteration: int, args: Args) -> float:
+    """`--max-kl` in the first iteration; with `--anneal-kl` it falls linearly, to a hundredth at the end."""
+    remaining = 1 - (iteration - 1) / args.num_iterations
+    return args.max_kl * max(remaining, 0.01) if args.anneal_kl else args.max_kl
+
+
+def trpo_step(policy: PolicyVector, batch: Batch, max_kl: float, args: Args) -> dict[str, float]:
     """The natural gradient step of the greatest length within the KL bound, and a line search back from there."""
     old = policy.vector.clone()
     old_mean, old_logstd = policy(old, batch.obs)
@@ -1459,13 +1468,13 @@ def trpo_step(policy: PolicyVector, batch: Batch, args: Args) -> dict[str, float
     some = torch.randperm(len(batch.obs), device=old.device)[:: args.fisher_every]
     multiply = fisher_product(policy, old, batch.obs[some], args.cg_damping)
     direction = conjugate_gradient(multiply, gradient, args.cg_iterations)
-    full = direction * torch.sqrt(2 * args.max_kl / (direction @ multiply(direction)).clamp(min=1e-12))
+    full = direction * torch.sqrt(2 * max_kl / (direction @ multiply(direction)).clamp(min=1e-12))
     for halvings in range(10):
         vector = old + 0.5**halvings * full
         mean, logstd = policy(vector, batch.obs)
         kl = gaussian_kl(old_mean, old_logstd, mean, logstd).mean()
         gain = objective(vector) - before
-        if kl <= args.kl_slack * args.max_kl and gain > 0:
+        if kl <= args.kl_slack * max_kl and gain > 0:
             policy.vector.copy_(vector)
             return {"losses/gain": gain.item(), "losses/kl": kl.item(), "charts/halvings": halvings}
     return {"losses/gain": 0.0, "losses/kl": 0.0, "charts/halvings": 10}
@@ -2019,7 +2028,8 @@ def main(args: Args) -> int:
         rollout = collect(agent, players, space, args, rng)
         rewards = pay(agent, rollout, space, args.reward_form, device)
         batch = make_batch(agent, rollout, rewards, space, args, device)
-        metrics = {"charts/imitation_reward": float(rewards.mean()), **trpo_step(policy, batch, args)}
+        metrics = {"charts/imitation_reward": float(rewards.mean())}
+        metrics |= trpo_step(policy, batch, kl_bound(iteration, args), args)
         metrics["losses/value_loss"] = update_values(agent, value_optimizer, batch, args)
         metrics["charts/policy_std"] = agent.actor_logstd.exp().mean().item()
         if iteration % args.g_steps == 0:

@@ -69,7 +69,7 @@ def test_a_step_of_trpo_improves_the_surrogate_within_the_bound():
     for seed in range(5):
         agent, policy, batch = make_batch(seed=seed)
         old = policy.vector.clone()
-        metrics = gail.trpo_step(policy, batch, args)
+        metrics = gail.trpo_step(policy, batch, args.max_kl, args)
         assert 0 < metrics["losses/kl"] <= 1.5 * args.max_kl and metrics["losses/gain"] > 0
         with torch.no_grad():
             (mean, logstd), (old_mean, old_logstd) = policy(policy.vector, batch.obs), policy(old, batch.obs)
@@ -81,17 +81,24 @@ def test_a_step_of_trpo_improves_the_surrogate_within_the_bound():
 
 def test_without_damping_the_full_step_is_as_long_as_the_bound_allows():
     """½ sᵀ F s = max KL for the step before the line search; in a quadratic model that is the KL divergence."""
-    args = gail.Args(alpha=0.0, cg_damping=1e-4, max_kl=1e-5, cg_iterations=60, fisher_every=1)
+    args = gail.Args(alpha=0.0, cg_damping=1e-4, cg_iterations=60, fisher_every=1)
     _, policy, batch = make_batch(2_000)
-    metrics = gail.trpo_step(policy, batch, args)
+    metrics = gail.trpo_step(policy, batch, 1e-5, args)
     assert metrics["charts/halvings"] == 0 and metrics["losses/kl"] == pytest.approx(1e-5, rel=0.1)
+
+
+def test_the_bound_falls_linearly_to_a_hundredth():
+    args = gail.Args(alpha=0.0, max_kl=0.02, num_iterations=200)
+    assert [gail.kl_bound(iteration, args) for iteration in (1, 51, 101)] == [0.02, 0.015, 0.01]
+    assert gail.kl_bound(200, args) == pytest.approx(0.0002)
+    assert gail.kl_bound(200, gail.Args(alpha=0.0, anneal_kl=False, num_iterations=200)) == 0.01
 
 
 def test_no_step_is_taken_where_none_helps():
     args = gail.Args(alpha=0.0)
     _, policy, batch = make_batch()
     old = policy.vector.clone()
-    metrics = gail.trpo_step(policy, batch._replace(advantages=torch.zeros(256)), args)
+    metrics = gail.trpo_step(policy, batch._replace(advantages=torch.zeros(256)), 0.01, args)
     assert torch.equal(policy.vector, old) and metrics["losses/kl"] == 0
 
 
@@ -295,9 +302,9 @@ def test_a_step_of_trpo_is_sb3_contrib_s(env_id, monkeypatch):
     old = policy.vector.clone()
     advantages = (steps.advantages - steps.advantages.mean()) / (steps.advantages.std() + 1e-8)
     batch = gail.Batch(steps.observations.float(), steps.actions, steps.actions, advantages, steps.returns)
-    same = {"cg_iterations": theirs.cg_max_steps, "cg_damping": theirs.cg_damping, "max_kl": theirs.target_kl}
-    same |= {name: action_dim * same[name] for name in ("cg_damping", "max_kl")}
-    metrics = gail.trpo_step(policy, batch, gail.Args(alpha=0.0, fisher_every=1, **same))
+    same = {"cg_iterations": theirs.cg_max_steps, "cg_damping": action_dim * theirs.cg_damping}
+    args = gail.Args(alpha=0.0, fisher_every=1, **same)
+    metrics = gail.trpo_step(policy, batch, action_dim * theirs.target_kl, args)
     assert metrics["charts/halvings"] == 0
 
     monkeypatch.setattr(torch, "randn_like", torch.zeros_like)  # theirs begins the search at a small random vector
