@@ -197,6 +197,22 @@ def test_an_expert_without_weight_is_not_learned_from(expert, tmp_path):
     assert (tmp_path / "with" / "updates.csv").read_bytes() == (tmp_path / "without" / "updates.csv").read_bytes()
 
 
+def test_the_student_never_sees_the_reward(student, expert, tmp_path, monkeypatch):
+    """With tenfold rewards it learns the same; those of its episodes are other ones."""
+
+    class RicherPlayers(gail.CarPlayers):
+        def step(self, *args, **options) -> gail.Steps:
+            before = self.returns.copy()
+            steps = super().step(*args, **options)
+            self.returns += 9 * np.where(self.returns > before, self.returns - before, 0)
+            return steps._replace(rewards=10 * steps.rewards)
+
+    monkeypatch.setattr(gail, "CarPlayers", RicherPlayers)
+    run(*SMALL_GAIL, "--demos-rl", expert / "demos", "--run-dir", "run", cwd=tmp_path, script=GAIL)
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (student / "updates.csv").read_bytes()
+    assert (tmp_path / "run" / "episodes.csv").read_bytes() != (student / "episodes.csv").read_bytes()
+
+
 def test_recorded_demonstrations_are_those_that_are_learned_from(student, expert, tmp_path):
     """The synthetic human's folder given as a recording leads to the same student."""
     flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--demos-human", student / "demos_synthetic_human"]
@@ -243,12 +259,17 @@ def test_a_saved_expert_drives_as_it_was_evaluated(expert, monkeypatch):
         (lambda folder: edit_manifest(folder, lambda m: m.update(version=2)), ["version 2"]),
         (lambda folder: edit_manifest(folder, lambda m: m.update(env_id="Hopper-v4")), ["Hopper-v4", "TorcsLike-v0"]),
         (lambda folder: edit_manifest(folder, lambda m: m["options"].update(track="city")), ["city", "meadow"]),
+        (lambda folder: edit_manifest(folder, lambda m: m["options"].update(brake=False)), ["--brake False", "True"]),
         (lambda folder: (folder / "episode_00000.npz").unlink(), ["episode_00000.npz", "cannot be read"]),
         (flip_a_byte, ["episode_00000.npz", "SHA-256"]),
         (lambda f: rewrite(f, lambda a: {**a, "observations": a["observations"][:, :5]}), ["(T + 1, 65)"]),
         (lambda f: rewrite(f, lambda a: {**a, "actions": a["actions"][:, 0]}), ["(T, 2)"]),
         (lambda f: rewrite(f, lambda a: {**a, "actions": a["actions"] * np.nan}), ["actions", "finite"]),
         (lambda f: rewrite(f, lambda a: {**a, "rewards": a["rewards"][:5]}), ["rewards"]),
+        (
+            lambda f: rewrite(f, lambda a: {**a, "observations": a["observations"][:1], "actions": a["actions"][:0]}),
+            ["step"],
+        ),
         (lambda f: rewrite(f, lambda a: {**a, "actions": np.array([{}], object)}), ["no demonstration"]),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

@@ -94,6 +94,22 @@ def test_the_bound_falls_linearly_to_a_hundredth():
     assert gail.kl_bound(200, gail.Args(alpha=0.0, anneal_kl=False, num_iterations=200)) == 0.01
 
 
+def test_the_line_search_goes_back_until_the_bound_holds():
+    """With a third of the bound allowed, a full step is too long, whatever it gains."""
+    args = gail.Args(alpha=0.0, fisher_every=1, kl_slack=0.3)
+    _, policy, batch = make_batch(2_000)
+    metrics = gail.trpo_step(policy, batch, 0.01, args)
+    assert metrics["charts/halvings"] == 1 and 0 < metrics["losses/kl"] <= 0.003 and metrics["losses/gain"] > 0
+
+
+def test_the_line_search_goes_back_until_the_surrogate_gains():
+    """With no limit on the KL divergence, a step far beyond the quadratic model loses."""
+    args = gail.Args(alpha=0.0, fisher_every=1, kl_slack=1e9)
+    _, policy, batch = make_batch(2_000)
+    metrics = gail.trpo_step(policy, batch, 1e4, args)
+    assert metrics["charts/halvings"] > 0 and metrics["losses/gain"] > 0
+
+
 def test_no_step_is_taken_where_none_helps():
     args = gail.Args(alpha=0.0)
     _, policy, batch = make_batch()
@@ -148,24 +164,20 @@ def test_the_best_discriminator_is_the_student_s_share():
     )
     logits = torch.zeros(3, requires_grad=True)
     optimizer = torch.optim.Adam([logits], 0.05)
-    draws = [torch.multinomial(x, 400_000, True, generator=torch.Generator().manual_seed(0)) for x in (p, rl, human)]
-    counts = [torch.bincount(draw, minlength=3) / 400_000 for draw in draws]
-    for _ in range(800):
-        parts = [
-            (F * n).sum()
-            for F, n in zip(
-                (torch.nn.functional.logsigmoid(logits), *2 * [torch.nn.functional.logsigmoid(-logits)]), counts
-            )
-        ]
-        loss = -(parts[0] + alpha * parts[1] + (1 - alpha) * parts[2])
+    draws = [torch.multinomial(x, 40_000, True, generator=torch.Generator().manual_seed(0)) for x in (p, rl, human)]
+    for _ in range(400):
+        loss, _ = gail.discriminator_loss(*(logits[draw] for draw in draws), alpha, 0.0)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     q = alpha * rl + (1 - alpha) * human
     assert torch.allclose(torch.sigmoid(logits), p / (p + q), atol=0.01)
-    pieces = [logits.detach()[draw[:50_000]] for draw in draws]
-    found, _ = gail.discriminator_loss(*pieces, alpha, 0.0)
-    assert found.item() == pytest.approx(loss.item(), abs=0.01)
+
+
+def test_accuracy_on_an_expert_without_weight_is_not_a_number():
+    _, metrics = gail.discriminator_loss(*torch.tensor([[1.0, -1.0], [1.0, -1.0], [-1.0, -1.0]]), 0.0, 0.0)
+    assert metrics["discriminator/accuracy_human"] == 1 and metrics["discriminator/accuracy_student"] == 0.5
+    assert metrics["discriminator/accuracy_rl"].isnan()
 
 
 def test_the_student_is_paid_for_looking_like_the_experts():

@@ -48,7 +48,7 @@ def test_ddpg_drives_past_the_first_parked_cars(tmp_path):
 
 def test_gail_drives_as_far_as_the_synthetic_human(tmp_path):
     """From its demonstrations alone; without learning the car stands still."""
-    flags = ["--alpha", 0, "--total-timesteps", 1_000_000, "--eval-episodes", 20, "--run-dir", "run"]
+    flags = ["--alpha", 0, "--bc-epochs", 0, "--total-timesteps", 1_000_000, "--eval-episodes", 20, "--run-dir", "run"]
     run(*flags, cwd=tmp_path, script=GAIL)
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     human, student = (

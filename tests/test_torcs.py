@@ -251,7 +251,7 @@ def test_tyre_forces_peak_at_the_grip_and_fall_when_they_slide():
 
 
 def test_finer_steps_change_little(monkeypatch):
-    """Half a minute of slalom at 100 km/h with 2 and with 40 substeps."""
+    """Ten seconds of slalom at 100 km/h with 2 and with 40 substeps."""
     ends = []
     for substeps in (torcs.SUBSTEPS, 40):
         monkeypatch.setattr(torcs, "SUBSTEPS", substeps)
