@@ -46,12 +46,13 @@ def test_ddpg_drives_past_the_first_parked_cars(tmp_path):
     assert evaluation(tmp_path, "--total-timesteps", 400_000, script=DDPG) > 320
 
 
-def test_gail_drives_as_far_as_the_synthetic_human(tmp_path):
-    """From its demonstrations alone; without learning the car stands still."""
-    flags = ["--alpha", 0, "--bc-epochs", 0, "--total-timesteps", 1_000_000, "--eval-episodes", 20, "--run-dir", "run"]
+def test_gail_drives_like_the_synthetic_human(tmp_path):
+    """From its demonstrations alone, without the start by cloning: at first the car comes 50 m far."""
+    flags = ["--alpha", 0, "--bc-epochs", 0, "--no-anneal-kl", "--total-timesteps", 2_000_000]
+    flags += ["--eval-episodes", 20, "--run-dir", "run"]
     run(*flags, cwd=tmp_path, script=GAIL)
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     human, student = (
         part["driving"]["score"]["mean"] for part in (result["experts"]["human"], result["evaluation"]["sampled"])
     )
-    assert student > 0.7 * human
+    assert student > 0.65 * human
