@@ -79,7 +79,9 @@ def main(args: Args) -> None:
     text = (
         f"`python benchmark/gail_hopper.py --seeds {args.seeds}`, commits: {'; '.join(made_at)}; this table at {commit()}."
         f" {sum(row['training_seconds'] for row in rows) / 3600:.1f} core-hours. Mean returns of 50 episodes each; share is "
-        "the sampled student's of the expert's, ± a 95% t-interval over seeds.\n\n" + "\n".join(lines) + "\n"
+        f"the sampled student's of the expert's, ± a 95% t-interval over seeds. Students: `{' '.join(map(str, STUDENT))}`.\n\n"
+        + "\n".join(lines)
+        + "\n"
     )
     (args.out / "table.md").write_text(text)
     print(text)
