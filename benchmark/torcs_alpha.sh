@@ -1,19 +1,20 @@
 #!/usr/bin/env bash
 # The driving task: DDPG experts (45 minutes each), the first of which the students learn from; hybrids over α (4 minutes
-# each), those of α = 0.5 without the discriminator's penalty or without the start by cloning, and clones of the drivers'
-# actions alone: the runs behind benchmark/results/torcs/. Can be sent again after every stop. An expert takes 0.9 GB of disk.
+# each), more seeds of those in Table 2.3, hybrids with one thing otherwise, and clones of the drivers' actions alone: the
+# runs behind benchmark/results/torcs/. Can be sent again after every stop. An expert takes 0.9 GB of disk.
 #   benchmark/torcs_alpha.sh
-#   SEEDS="1" ALPHAS="0.5" WORKERS=1 benchmark/torcs_alpha.sh
+#   SEEDS="1" MORE_SEEDS="" ALPHAS="0.5" WORKERS=1 OUT=runs/first_look benchmark/torcs_alpha.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
-EXPERTS=${EXPERTS:-1 2} SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/torcs}
+EXPERTS=${EXPERTS:-1 2} SEEDS=${SEEDS:-1 2 3} MORE_SEEDS=${MORE_SEEDS-4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/torcs}
+OUT=${OUT:-benchmark/results/torcs}
 ALPHAS=${ALPHAS:-0.5 0.0 1.0 0.7 0.3 0.9 0.1 0.8 0.2 0.6 0.4}
 MIXED=${MIXED:-0.5 0.0 1.0}
 mkdir -p "$RUNS"
 for seed in $EXPERTS; do
   echo "--seed $seed --run-dir $RUNS/expert_seed$seed"
 done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220 --resume
-for seed in $SEEDS; do
+for seed in $SEEDS $MORE_SEEDS; do
   human="$RUNS/human_seed$seed"
   [ -e "$human/manifest.json" ] || "$PYTHON" benchmark/torcs_players.py --seed "$seed" --demos "$human"
 done
@@ -27,9 +28,15 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
   for alpha in $ALPHAS; do
     for seed in $SEEDS; do student "$seed" "$alpha" "alpha$alpha"; done
   done
+  for seed in $MORE_SEEDS; do
+    for alpha in 0.5 0.0; do student "$seed" "$alpha" "alpha$alpha"; done
+    student "$seed" 0.5 mix_alpha0.5 --total-timesteps 0 --bc-epochs 20
+  done
   for seed in $SEEDS; do
     student "$seed" 0.5 penalty0_alpha0.5 --d-grad-penalty 0
     student "$seed" 0.5 bc0_alpha0.5 --bc-epochs 0
+    student "$seed" 0.5 noanneal_alpha0.5 --no-anneal-kl
+    student "$seed" 0.5 fisher1_alpha0.5 --fisher-every 1
   done
 } | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/gail_hybrid.py --save-model --save-demos 20 --eval-episodes 100 --resume
-"$PYTHON" benchmark/torcs_report.py --runs "$RUNS"
+"$PYTHON" benchmark/torcs_report.py --runs "$RUNS" --expert "${EXPERTS%% *}" --out "$OUT"

@@ -4,7 +4,8 @@
 
 Takes whatever part of the runs of `benchmark/torcs_alpha.sh` is done, and says which. The score is that of Table 2.3:
 metres in windows of 5 s times 3.6 as the mean of each episode, 0 for the window with a crash or standstill, behind which
-there are none; intervals are 95% t-intervals of the seeds' means.
+there are none. Intervals are 95% t-intervals of the seeds' means; a seed has its own human and student, but all students
+have the same DDPG expert.
 """
 
 import json
@@ -53,7 +54,7 @@ def read_runs(folder: Path, expert: int) -> list[dict]:
         rows += [run_row(path.parent, mode, numbers["driving"], run) for mode, numbers in evaluations.items()]
     for path in sorted(folder.glob("*_seed*/manifest.json")) + sorted(folder.glob("expert_seed*/demos/manifest.json")):
         run = path.parent.parent if path.parent.name == "demos" else path.parent
-        if run == path.parent or (run / "result.json").exists():
+        if run == path.parent or is_complete(run):
             track = gail.Track(*gail.TRACKS[json.loads(path.read_text())["options"]["track"]])
             driving = gail.driving_scores(read_episodes(path.parent, 10_000), track.length)
             rows.append(run_row(run, "demonstrations", driving, {}))
@@ -61,6 +62,12 @@ def read_runs(folder: Path, expert: int) -> list[dict]:
         if row["kind"] == "expert" and row["seed"] != expert:
             row["kind"] = "other"
     return rows
+
+
+def is_complete(folder: Path) -> bool:
+    """Whether a run has come to its end, and not been stopped on the way."""
+    path = folder / "result.json"
+    return path.exists() and json.loads(path.read_text())["complete"]
 
 
 def run_row(folder: Path, mode: str, driving: dict, run: dict) -> dict:
@@ -88,21 +95,33 @@ def select(rows: list[dict], kind: str, mode: str) -> list[dict]:
     return [row for row in rows if row["kind"] == kind and row["mode"] == mode]
 
 
+def mean_score(rows: list[dict], kind: str, mode: str = "demonstrations") -> float:
+    """Of all seeds; nan where there is none."""
+    return float(np.mean([row["mean"] for row in select(rows, kind, mode)] or [np.nan]))
+
+
+def pooled_std(rows: list[dict]) -> float:
+    """Deviation of all episodes of all seeds, of which each has as many."""
+    means, stds = (np.array([row[key] for row in rows]) for key in ("mean", "std"))
+    return float(np.sqrt(np.mean(stds**2) + np.var(means)))
+
+
 def table_2_3(rows: list[dict]) -> str:
     """Table 2.3, published beside measured."""
     published = published_table("table_2_3.csv")
-    best = float(published["DDPG"]["avg"])
-    lines = [
-        "| driver | | seeds | max | min | avg | std | of DDPG's | ended early | laps in 60 s |",
-        "|---|" + "---|" * 9,
-    ]
-    expert, _ = interval([row["mean"] for row in select(rows, "expert", "demonstrations")])
+    columns = ["driver", "acts", "seeds", "episodes", "max", "min", "avg", "std of all", "of DDPG's", "of the human's"]
+    columns += ["m in 5 s", "ended early", "laps in 60 s"]
+    lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
+    theirs = [float(published[name]["avg"]) for name in ("DDPG", "human")]
+    ours = [mean_score(rows, kind) for kind in ("expert", "human")]
     groups = {
         "DDPG": [("demonstrations", "expert"), ("evaluation", "expert")],
         "other DDPG experts": [("evaluation", "other")],
         "hybrid, α = 0.5": [(mode, "alpha0.5") for mode in MODES],
-        "the same without penalty": [(mode, "penalty0_alpha0.5") for mode in MODES],
-        "the same without cloning first": [(mode, "bc0_alpha0.5") for mode in MODES],
+        "without the discriminator's penalty": [(mode, "penalty0_alpha0.5") for mode in MODES],
+        "without cloning first": [(mode, "bc0_alpha0.5") for mode in MODES],
+        "with a constant KL bound": [(mode, "noanneal_alpha0.5") for mode in MODES],
+        "Fisher matrix of the whole batch": [(mode, "fisher1_alpha0.5") for mode in MODES],
         "human": [("demonstrations", "human")],
         "GAIL, α = 0": [(mode, "alpha0.0") for mode in MODES],
         "GAIL on DDPG, α = 1": [(mode, "alpha1.0") for mode in MODES],
@@ -113,21 +132,45 @@ def table_2_3(rows: list[dict]) -> str:
     for name, group in groups.items():
         if name in published:
             cells = [published[name][key] for key in ("max", "min", "avg", "std")]
-            lines.append(
-                f"| {name} | **published** | | {' | '.join(cells)} | {float(published[name]['avg']) / best:.2f} | | |"
-            )
+            cells += [f"{float(published[name]['avg']) / other:.2f}" for other in theirs]
+            lines.append(f"| {name} | **published** | | | {' | '.join(cells)} | | | |")
         for mode, kind in group:
             found = select(rows, kind, mode)
             if found:
-                extremes = [f"{max(row['max'] for row in found):.0f}", f"{min(row['min'] for row in found):.0f}"]
-                means = [with_interval([row[key] for row in found], 1) for key in ("mean", "std")]
-                ended = sum(row["crashes"] + row["standstills"] for row in found)
-                share = ended / sum(row["episodes"] for row in found)
-                ratio = f"{np.mean([row['mean'] for row in found]) / expert:.2f}" if expert else ""
-                laps = f"{np.mean([row['mean_laps'] for row in found]):.2f}"
-                cells = (name, mode, len(found), *extremes, *means, ratio, f"{100 * share:.0f}%", laps)
-                lines.append(f"| {' | '.join(map(str, cells))} |")
+                episodes = sum(row["episodes"] for row in found)
+                cells = [name, mode, str(len(found)), str(episodes)]
+                cells += [f"{max(row['max'] for row in found):.0f}", f"{min(row['min'] for row in found):.0f}"]
+                cells += [with_interval([row["mean"] for row in found], 1), f"{pooled_std(found):.1f}"]
+                cells += [f"{mean_score(rows, kind, mode) / other:.2f}" for other in ours]
+                cells += [f"{np.mean([row['metres_in_5_s'] for row in found]):.0f}"]
+                cells += [f"{100 * sum(row['crashes'] + row['standstills'] for row in found) / episodes:.0f}%"]
+                cells += [f"{np.mean([row['mean_laps'] for row in found]):.2f}"]
+                lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def difference(rows: list[dict], kind: str, mode: str, other: str, other_mode: str) -> tuple[str, int]:
+    """How much higher a driver scores than another, seed by seed, with its interval; and the number of seeds of both."""
+    ours, theirs = (
+        {row["seed"]: row["mean"] for row in select(rows, *pair)} for pair in ((kind, mode), (other, other_mode))
+    )
+    both = sorted(ours.keys() & theirs.keys())
+    return with_interval([ours[seed] - theirs[seed] for seed in both], 1) if both else "", len(both)
+
+
+def differences_table(rows: list[dict]) -> str:
+    """The comparisons that section 2.4.3 makes, and that with the mixture of section 2.3.2."""
+    lines = ["| | published | sampled | greedy | seeds |", "|---|---|---|---|---|"]
+    published = {name: float(row["avg"]) for name, row in published_table("table_2_3.csv").items()}
+    scale = mean_score(rows, "expert") / published["DDPG"]
+    names = {"human": "human", "alpha0.0": "GAIL, α = 0", "mix_alpha0.5": "actions mixed, α = 0.5"}
+    pairs = [("alpha0.5", "human"), ("alpha0.5", "alpha0.0"), ("alpha0.0", "human"), ("alpha0.5", "mix_alpha0.5")]
+    for kind, other in pairs:
+        found = [difference(rows, kind, m, other, "demonstrations" if other == "human" else m) for m in MODES]
+        ours, theirs = ("hybrid, α = 0.5" if kind == "alpha0.5" else names[kind]), names[other]
+        old = f"{(published[ours] - published[theirs]) * scale:+.0f}" if theirs in published else ""
+        lines.append(f"| {ours}, less {theirs} | {old} | {found[0][0]} | {found[1][0]} | {found[0][1]} |")
+    return "\n".join(lines) + f"\n\nPublished differences times {scale:.2f}, as the DDPG experts are to each other.\n"
 
 
 def alpha_curve(rows: list[dict], mode: str) -> dict[float, list[float]]:
@@ -153,8 +196,7 @@ def figure_2_8(rows: list[dict]) -> Figure:
     """Score over α, with the published ones scaled as their DDPG is to ours."""
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axes = figure.subplots()
-    expert, _ = interval([row["mean"] for row in select(rows, "expert", "demonstrations")])
-    human, _ = interval([row["mean"] for row in select(rows, "human", "demonstrations")])
+    expert, human = mean_score(rows, "expert"), mean_score(rows, "human")
     for mode, colour in zip(MODES, ("tab:blue", "tab:orange")):
         curve = alpha_curve(rows, mode)
         means, halves = np.array([interval(scores) for scores in curve.values()]).T
@@ -265,11 +307,11 @@ def habits(episodes: list[dict[str, np.ndarray]], track) -> dict[str, float]:
 def drivers(folder: Path, expert: int, most: int) -> dict[str, list[list[dict[str, np.ndarray]]]]:
     """Demonstrations of each driver, a list for each finished run that has some."""
     found = {name: [] for name in EXPERTS.values()}
-    for run in sorted(folder.glob("*_seed*")):
+    for run in sorted(path for path in folder.glob("*_seed*") if path.is_dir()):
         kind, seed = run.name.rsplit("_seed", 1)
         if kind == "expert" and int(seed) != expert:
             continue
-        if kind == "human" or (run / "result.json").exists():
+        if kind == "human" or is_complete(run):
             episodes = read_episodes(run if kind == "human" else run / "demos", most)
             found.setdefault(EXPERTS.get(kind, kind), []).extend([episodes] if episodes else [])
     return {name: seeds for name, seeds in found.items() if seeds}
@@ -322,12 +364,17 @@ def main(args: Args) -> None:
     rows = read_runs(args.runs, args.expert)
     if not rows:
         raise SystemExit(f"--runs {args.runs}: holds no finished run")
+    if not select(rows, "expert", "demonstrations"):
+        raise SystemExit(
+            f"--expert {args.expert}: {args.runs} holds no finished run of that expert with demonstrations"
+        )
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "runs.csv", rows)
     sections = {
         "Table 2.3": table_2_3(rows),
+        "Differences, seed by seed": differences_table(rows),
         "Fig. 2.8": alpha_table(rows),
-        "How they drive": habit_tables(args.runs, args.expert, 20),
+        "How they drive (sampled students)": habit_tables(args.runs, args.expert, 20),
     }
     text = (
         provenance(rows)

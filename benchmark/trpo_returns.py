@@ -48,9 +48,8 @@ class PaidPlayers(gail.GymPlayers):
     """Players that keep the environment's rewards."""
 
     def step(self, actions: np.ndarray) -> gail.Steps:
-        before = self.returns[0]
         steps = super().step(actions)
-        self.rewards.append((steps.ended[0][1] if steps.ended else self.returns[0]) - before)
+        self.rewards.append(steps.rewards[0])
         return steps
 
 

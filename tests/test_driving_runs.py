@@ -232,8 +232,10 @@ def test_the_report_takes_whatever_is_done(expert, student, tmp_path):
     run("--runs", "runs", "--out", "out", cwd=tmp_path, script=ROOT / "benchmark" / "torcs_report.py")
     text = (tmp_path / "out" / "table.md").read_text()
     human = json.loads((student / "result.json").read_text())["experts"]["human"]["driving"]["score"]
-    assert f"| human | demonstrations | 1 | {human['max']:.0f} | {human['min']:.0f} | {human['mean']:.1f} |" in text
-    assert "| DDPG | **published** | | 823 | 818 | 819 | 0.5 | 1.00 |" in text
+    extremes = f"{human['max']:.0f} | {human['min']:.0f}"
+    assert f"| human | demonstrations | 1 | 2 | {extremes} | {human['mean']:.1f} | {human['std']:.1f} |" in text
+    assert "| DDPG | **published** | | | 823 | 818 | 819 | 0.5 | 1.00 | 1.29 |" in text
+    assert "| hybrid, α = 0.5, less human | " in text
     assert "| actions mixed, α = 0.5 | greedy | 1 |" in text and "| DDPG | 1 |" in text
     assert (tmp_path / "out" / "fig_2_8.png").stat().st_size > 10_000
     with open(tmp_path / "out" / "runs.csv", newline="") as file:
