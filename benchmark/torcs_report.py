@@ -317,10 +317,32 @@ def drivers(folder: Path, expert: int, most: int) -> dict[str, list[list[dict[st
     return {name: seeds for name, seeds in found.items() if seeds}
 
 
-def habit_tables(folder: Path, expert: int, most: int) -> str:
+def paths_figure(found: dict[str, list[list[dict[str, np.ndarray]]]], track, episodes: int = 6) -> Figure:
+    """The first lap of some episodes of each driver's first seed, with the road unrolled; crosses are crashes."""
+    names = {"DDPG": "DDPG", "human": "synthetic human", "alpha0.0": "GAIL, α = 0", "alpha0.5": "hybrid, α = 0.5"}
+    names |= {"mix_alpha0.5": "actions mixed, α = 0.5"}
+    shown = [name for name in names if name in found]
+    figure = Figure(figsize=(11, 1 + 1.3 * len(shown)), layout="constrained")
+    for axes, name in zip(figure.subplots(len(shown), sharex=True, squeeze=False)[:, 0], shown):
+        for begin, length in zip(track.distances[track.curvatures != 0], track.lengths[track.curvatures != 0]):
+            axes.axvspan(begin, begin + length, color="0.93", linewidth=0)
+        for episode in found[name][0][:episodes]:
+            trace = traces(episode, track)
+            steps = np.searchsorted(trace["place"], track.length)
+            axes.plot(trace["place"][:steps], trace["left"][:steps], color="tab:blue", linewidth=0.8)
+            if (episode["rewards"] == -1).any() and steps == len(trace["place"]):
+                axes.plot(trace["place"][-1], trace["left"][-1], "x", color="tab:red", clip_on=False, zorder=3)
+        parked = gail.PARKED, np.array(gail.PARKED_LEFT) * track.half_width
+        axes.plot(*parked, "s", color="black", markersize=4)
+        axes.set(xlim=(gail.START - 10, track.length), ylim=(-track.half_width, track.half_width), ylabel="left, m")
+        axes.set_title(names[name], fontsize="medium", loc="left")
+    axes.set_xlabel("way from the start line, m; curves are grey, parked cars black")
+    return figure
+
+
+def habit_tables(found: dict[str, list[list[dict[str, np.ndarray]]]], track) -> str:
     """How each driver drives; and on which side of each parked car."""
-    track = gail.Track(*gail.TRACKS["meadow"])
-    measured = {name: [habits(part, track) for part in seeds] for name, seeds in drivers(folder, expert, most).items()}
+    measured = {name: [habits(part, track) for part in seeds] for name, seeds in found.items()}
     columns = {
         "speed": "km/h",
         "into curves": "into curves, km/h",
@@ -368,13 +390,14 @@ def main(args: Args) -> None:
         raise SystemExit(
             f"--expert {args.expert}: {args.runs} holds no finished run of that expert with demonstrations"
         )
+    track, found = gail.Track(*gail.TRACKS["meadow"]), drivers(args.runs, args.expert, 20)
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "runs.csv", rows)
     sections = {
         "Table 2.3": table_2_3(rows),
         "Differences, seed by seed": differences_table(rows),
         "Fig. 2.8": alpha_table(rows),
-        "How they drive (sampled students)": habit_tables(args.runs, args.expert, 20),
+        "How they drive (sampled students)": habit_tables(found, track),
     }
     text = (
         provenance(rows)
@@ -382,6 +405,7 @@ def main(args: Args) -> None:
         + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
     )
     (args.out / "table.md").write_text(text)
+    paths_figure(found, track).savefig(args.out / "paths.png", dpi=110)
     if alpha_curve(rows, "sampled"):
         figure_2_8(rows).savefig(args.out / "fig_2_8.png", dpi=130)
     print(text)
