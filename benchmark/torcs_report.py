@@ -25,6 +25,7 @@ from cleanrl_thesis import gail_hybrid as gail
 MODES = ("sampled", "greedy")
 EXPERTS = {"expert": "DDPG", "human": "human"}  # folders whose demonstrations are what the students learned from
 BEFORE = 60.0  # m before a curve, where its braking is measured from
+NEAR = 50.0  # m, of the way along the road
 TREMBLE = 0.05  # a turn of the wheel by less of its lock is not counted as a change
 
 
@@ -274,7 +275,7 @@ def habits(episodes: list[dict[str, np.ndarray]], track) -> dict[str, float]:
     curves = track.distances[(track.curvatures != 0) & (np.roll(track.curvatures, 1) != track.curvatures)]
     found = defaultdict(list)
     steps = sum(len(episode["rewards"]) for episode in episodes)
-    changes = crashes = into_cars = 0
+    changes, crashes, into_cars, near_each = 0, 0, 0, np.zeros(len(parked), int)
     for episode in episodes:
         trace = traces(episode, track)
         place, speed = trace["place"], trace["speed"]
@@ -291,9 +292,9 @@ def habits(episodes: list[dict[str, np.ndarray]], track) -> dict[str, float]:
             found[f"left of {number}"].append(way > 0)
         if (episode["rewards"] == -1).any():
             crashes += 1
-            ways = (parked - place[-1] + 8) % track.length - 8
-            on_road = abs(trace["left"][-1]) <= track.half_width
-            into_cars += bool(on_road and (np.abs(ways) < gail.CAR_LENGTH + 1).any())
+            ways = np.abs((parked - place[-1] + track.length / 2) % track.length - track.length / 2)
+            near_each[ways.argmin()] += ways.min() < NEAR
+            into_cars += bool(abs(trace["left"][-1]) <= track.half_width and ways.min() < gail.CAR_LENGTH + 1)
     means = {name: float(np.mean(values)) for name, values in found.items()}
     return {
         **means,
@@ -301,6 +302,8 @@ def habits(episodes: list[dict[str, np.ndarray]], track) -> dict[str, float]:
         "episodes": len(episodes),
         "crashes": crashes,
         "into cars": into_cars,
+        "near cars": near_each.sum(),
+        **{f"near {number}": count for number, count in enumerate(near_each)},
     }
 
 
@@ -351,18 +354,22 @@ def habit_tables(found: dict[str, list[list[dict[str, np.ndarray]]]], track) -> 
         "changes": "wheel turned back, per s",
     }
     lines = [
-        f"| driver | seeds | {' | '.join(columns.values())} | episodes | crashes | of them into cars |",
-        "|---|" + "---|" * 9,
+        f"| driver | seeds | {' | '.join(columns.values())} | episodes | crashes | within {NEAR:.0f} m of a parked car | into one |",
+        "|---|" + "---|" * 10,
     ]
     for name, seeds in measured.items():
         cells = [with_interval([habit[key] for habit in seeds if key in habit], 1) for key in columns]
-        sums = [sum(habit[key] for habit in seeds) for key in ("episodes", "crashes", "into cars")]
+        sums = [sum(habit[key] for habit in seeds) for key in ("episodes", "crashes", "near cars", "into cars")]
         lines.append(f"| {name} | {len(seeds)} | {' | '.join(map(str, [*cells, *sums]))} |")
-    lines += ["", "Share of passes on the left of each parked car, by its way from the start line:", ""]
-    lines += [f"| driver | {' | '.join(f'{way} m' for way in gail.PARKED)} |", "|---|" + "---|" * len(gail.PARKED)]
+    head = [f"| driver | {' | '.join(f'{way} m' for way in gail.PARKED)} |", "|---|" + "---|" * len(gail.PARKED)]
+    lines += ["", "Share of passes on the left of each parked car, by its way from the start line:", "", *head]
     for name, seeds in measured.items():
         sides = [[habit[f"left of {i}"] for habit in seeds if f"left of {i}" in habit] for i in range(len(gail.PARKED))]
         lines.append(f"| {name} | {' | '.join(f'{np.mean(side):.2f}' if side else '' for side in sides)} |")
+    lines += ["", f"Crashes within {NEAR:.0f} m of each, in the same episodes:", "", *head]
+    for name, seeds in measured.items():
+        counts = [str(sum(habit[f"near {i}"] for habit in seeds)) for i in range(len(gail.PARKED))]
+        lines.append(f"| {name} | {' | '.join(counts)} |")
     return "\n".join(lines) + "\n"
 
 
