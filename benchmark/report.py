@@ -16,6 +16,7 @@ where the interval is above 0, contradicted where it is below, and open else, or
 
 import json
 import os
+import re
 from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -298,7 +299,7 @@ def latex(lines: list[list[str]], caption: str) -> str:
     def escape(text: str) -> str:
         for old, new in (("%", r"\%"), ("&", r"\&"), ("_", r"\_"), ("d\\_target", r"$d_\mathrm{target}$"), ("–", "--")):
             text = text.replace(old, new)
-        return text
+        return re.sub(r"(?<![\w-])-(?=\d)", "$-$", text)
 
     head, *body = (" & ".join(map(escape, line)) + r" \\" for line in lines)
     columns = "l" + "r" * (len(lines[0]) - 1)

@@ -25,7 +25,7 @@ agent, and its score stands to the DDPG experts' as in Table 2.3. `--demos-human
 | an action is held, while driving | for 5 steps, 0.1 s, as by `ddpg_torcs_like.py` | ours; the study's code acts in each step |
 | penalty on the discriminator's gradient | 10 (`--d-grad-penalty 0`: Eq. 2.3.1 alone) | ours; the number is that of Gulrajani et al. 2017 |
 | start by behaviour cloning | 20 passes (`--bc-epochs 0`: none) | an option of the study's code |
-| Fisher matrix | from a fifth of a batch | OpenAI Baselines' |
+| Fisher matrix | from a fifth of a batch | OpenAI Baselines'; the full step is then too long and is halved, to the same scores |
 | actions that the discriminator sees | within the bounds | ours; the study's code shows them as sampled |
 | CG iterations, damping; γ, λ; passes over the value function, rate; entropies | 10, 0.1; 0.995, 0.97; 5, 1e-3; 0, 1e-3 | the study's code |
 | which label is the expert's | D → 0 | Eq. 2.3.1; the prose and the study's code have D and 1 − D swapped |

@@ -5,6 +5,7 @@ import importlib
 import itertools
 import json
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -188,6 +189,21 @@ def test_the_whole_report(study, tmp_path):
     assert names == {f"{name}.png" for name in figures}
     tex = (tmp_path / "out" / "tables.tex").read_text()
     assert tex.count(r"\begin{tabular}") == tex.count(r"\end{table}") == 7 and "$d_\\mathrm{target}$ = 0.03 &" in tex
+
+
+def test_latex_escapes_and_has_minus_signs():
+    text = report.latex([["", "K = 4"], ["Reacher-v2, d_target = 0.03, 5%", "–6 / -6.3 / 1-2"]], "a_b")
+    assert "Reacher-v2, $d_\\mathrm{target}$ = 0.03, 5\\% & --6 / $-$6.3 / 1-2 \\\\" in text and "{a\\_b}" in text
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
+def test_the_latex_tables_compile(study, tmp_path):
+    report.main(report.Args(runs=study, steps=102_400, out=tmp_path, workers=1))
+    frame = r"\documentclass{article}\usepackage{booktabs}\begin{document}\input{tables}\end{document}"
+    (tmp_path / "all.tex").write_text(frame)
+    command = ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "all.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:]
 
 
 @pytest.mark.parametrize("part", ["one run", "no plain PPO", "plain PPO alone", "a task of one's own"])
