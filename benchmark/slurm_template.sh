@@ -16,6 +16,7 @@ lines=({{lines}})
 task="${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"
 queue_again() { scontrol requeue "$task" && exit 0 || exit 1; }
 checkpoint() {
+  trap "" USR1  # Slurm may send it again, and a second one would end the run without a checkpoint
   kill -USR1 "$run"
   wait "$run"
   settle $?

@@ -188,7 +188,7 @@ def test_a_sweep_survives_the_death_of_a_node_and_a_warning(cluster, tmp_path):
         assert_same_run(whole / folder.name[-1], folder)
     assert len(list((tmp_path / "runs").glob("*__seed*/result.json"))) == 4
     logs = "\n".join(path.read_text() for path in (tmp_path / "runs" / "logs").glob("slurm_*.log"))
-    assert logs.count("stopped by signal 10") == 1, logs
+    assert "stopped by signal 10" in logs, logs  # more than once where Slurm, busy with the dead node, sends it again
     log = (cluster.folder / "slurmctld.log").read_text()
     assert log.count("Requeu") + log.count("requeue") >= 2, log
 
