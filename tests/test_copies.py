@@ -11,6 +11,7 @@ METHODS = sorted(
 # (name, file): one line that says why it differs there; files with the same line have to be equal
 PPO, DQN, DISTILL = "ppo_continuous_kle.py", "dqn_apple.py", "distill_hybrid.py"
 DDPG, GAIL = "ddpg_torcs_like.py", "gail_hybrid.py"
+ROOMS = "ppo_fourrooms.py"
 DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's two files
     "FPS": "control steps a second",
     "make_env": "bounded Box actions, and the options of the driving task",
@@ -49,6 +50,18 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("read_episode", GAIL): "continuous actions, two experts",
     ("EVALUATION_STREAM", GAIL): "its demonstrations are other episodes than the expert's",
     ("save_demonstrations", GAIL): "the student's policy, sampled or greedy, and the track",
+    ("Batch", ROOMS): "images and discrete actions",
+    ("Collector", ROOMS): "games by tables, whose state is a few arrays",
+    ("Rollout", ROOMS): "images, and what the policy said of them",
+    ("Update", ROOMS): "autograd and torch's Adam: the convolutions take the time",
+    ("gae", ROOMS): "all games at once",
+    ("make_batch", ROOMS): "the values are there already",
+    ("make_env", ROOMS): "the side of the frames",
+    ("play", ROOMS): "keeps states instead of frames",
+    ("ppo_loss", ROOMS): "discrete actions",
+    ("record_video", ROOMS): "frames of the agent's own size",
+    ("save_demonstrations", ROOMS): "draws the frames of the states",
+    ("write_demonstrations", ROOMS): "compressed",
 }
 OWN = {  # each method's own by design
     *("Args", "Agent", "complete_args", "main", "evaluate", "finish_run", "plot_learning_curve", "print_table"),

@@ -7,6 +7,7 @@ from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_apple as dqn
 from cleanrl_thesis import gail_hybrid as gail
+from cleanrl_thesis import ppo_fourrooms as rooms
 
 BAD_DQN = [
     (["--env-id", "Pendulum-v1"], ["--env-id", "Pendulum-v1", "Discrete"]),
@@ -63,7 +64,20 @@ BAD_GAIL = [
     (["--alpha", 1, "--demos-rl", "no/such/folder"], ["--demos-rl", "no/such/folder", "manifest"]),
     (["--alpha", 0, "--demos-human", "no/such/folder"], ["--demos-human", "no/such/folder", "manifest"]),
 ]
-BAD = {dqn: BAD_DQN, distill: BAD_DISTILL, ddpg: BAD_DDPG, gail: BAD_GAIL}
+BAD_ROOMS = [
+    (["--env-id", "MiniGrid-FourRooms-v0"], ["--env-id", "MiniGrid-FourRooms-v0", "FourRooms11-v0"]),
+    (["--frame-side", 21], ["--frame-side", "21", "even"]),
+    (["--frame-side", 256], ["--frame-side", "256", "128"]),
+    (["--num-minibatches", 7], ["--num-minibatches", "7", "divide"]),
+    (["--num-envs", 4, "--num-steps", 4], ["--num-minibatches", "16", "2 steps"]),
+    (["--total-timesteps", 100], ["--total-timesteps", "100", "16384"]),
+    (["--demo-mode", "best"], ["--demo-mode", "best"]),
+    (["--ent-coef", "-1"], ["--ent-coef", "-1.0"]),
+    (["--gamma", "nan"], ["--gamma", "nan"]),
+    (["--eval-episodes", 0], ["--eval-episodes", "0"]),
+    (["--resume"], ["--resume", "--run-dir"]),
+]
+BAD = {dqn: BAD_DQN, distill: BAD_DISTILL, ddpg: BAD_DDPG, gail: BAD_GAIL, rooms: BAD_ROOMS}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,216 @@
+"""PPO in FourRooms: its functions against independent sources, and small runs through the command line."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, kill_twice, needs_compiler, run
+
+from cleanrl_thesis import ppo_fourrooms as method
+
+SCRIPT = ROOT / "cleanrl_thesis" / "ppo_fourrooms.py"
+# 6 batches of 128 steps, a checkpoint after each
+SMALL = [
+    *("--total-timesteps", 768, "--num-envs", 8, "--num-steps", 16, "--num-minibatches", 4, "--channels", 4),
+    *("--hidden-size", 16, "--checkpoint-interval", 1, "--eval-episodes", 5, "--learning-rate", 0.01),
+]
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rooms")
+    run(*SMALL, "--run-dir", "run", "--save-model", "--save-demos", 3, cwd=folder, script=SCRIPT)
+    return folder / "run"
+
+
+def small_args(**changes) -> method.Args:
+    return method.complete_args(
+        method.Args(num_envs=8, num_steps=16, num_minibatches=4, total_timesteps=128, **changes)
+    )
+
+
+def test_gae_is_the_sum_of_its_definition():
+    """Σ (γλ)^l δ_{t+l} up to the end of the episode, term by term."""
+    rng, steps, games, gamma, gae_lambda = np.random.default_rng(0), 12, 3, 0.97, 0.9
+    rewards, dones = rng.normal(size=(steps, games)), (rng.random((steps, games)) < 0.2).astype(float)
+    values = rng.normal(size=(steps + 1, games))
+    advantages = method.gae(rewards, values, dones, gamma, gae_lambda)
+    for i in range(games):
+        for t in range(steps):
+            total = 0.0
+            for k in range(t, steps):
+                next_value = 0 if dones[k, i] else values[k + 1, i]
+                total += (gamma * gae_lambda) ** (k - t) * (rewards[k, i] + gamma * next_value - values[k, i])
+                if dones[k, i]:
+                    break
+            assert advantages[t, i] == pytest.approx(total)
+
+
+def test_ppo_loss_against_categorical():
+    torch.manual_seed(0)
+    logits, old_logits, values = torch.randn(64, 3), torch.randn(64, 3), torch.randn(64)
+    new, old = torch.distributions.Categorical(logits=logits), torch.distributions.Categorical(logits=old_logits)
+    actions, advantages, returns = old.sample(), torch.randn(64), torch.randn(64)
+    batch = method.Batch(torch.zeros(64, 1), actions, old.log_prob(actions), advantages, returns)
+    loss, (pg_loss, v_loss, entropy, kl, clipfrac) = method.ppo_loss(logits, values, batch, 0.2, 0.01, 0.5)
+    ratio = (new.log_prob(actions) - old.log_prob(actions)).exp()
+    normalised = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+    terms = [min(float(a * r), float(a * min(max(r, 0.8), 1.2))) for a, r in zip(normalised, ratio)]
+    assert pg_loss.item() == pytest.approx(-np.mean(terms), rel=1e-4)
+    assert v_loss.item() == pytest.approx(0.5 * torch.nn.functional.mse_loss(values, returns).item())
+    assert entropy.item() == pytest.approx(new.entropy().mean().item(), rel=1e-5)
+    assert kl.item() == pytest.approx((ratio - 1 - ratio.log()).mean().item(), rel=1e-4)
+    assert clipfrac.item() == pytest.approx(((ratio < 0.8) | (ratio > 1.2)).float().mean().item())
+    assert loss.item() == pytest.approx((pg_loss + 0.5 * v_loss - 0.01 * entropy).item(), rel=1e-5)
+
+
+def test_sampled_actions_follow_the_softmax():
+    logits = torch.log(torch.tensor([0.7, 0.2, 0.1])).repeat(100_000, 1) + 5
+    shares = torch.bincount(method.sample_actions(logits, torch.Generator().manual_seed(0))) / 100_000
+    assert torch.allclose(shares, torch.tensor([0.7, 0.2, 0.1]), atol=0.01)
+
+
+def test_a_rollout_is_what_the_games_gave():
+    """Played again from its seeds: frames, rewards, values; a time-out is paid with the value of its last frame."""
+    args, device = small_args(seed=3), torch.device("cpu")
+    torch.manual_seed(0)
+    agent, collector = method.Agent(args.frame_side, 3, 4, 16), method.Collector(args, device)
+    games = collector.envs.games
+    games.steps[:] = 90  # so that episodes are cut off
+    envs = method.FourRoomsVectorEnv(8, 11, args.frame_side)
+    obs, _ = envs.reset(seed=[method.episode_seed(3, i, 0) for i in range(8)])
+    envs.games.steps[:] = 90
+    rollout, cut_off, episodes = collector.collect(agent), 0, 0
+    for t in range(16):
+        assert np.array_equal(rollout.obs[t].numpy(), obs)
+        with torch.no_grad():
+            logits, values = agent(torch.from_numpy(obs))
+        assert np.allclose(rollout.values[t], values)
+        logprobs = torch.distributions.Categorical(logits=logits).log_prob(rollout.actions[t])
+        assert torch.allclose(rollout.logprobs[t], logprobs, atol=1e-6)
+        obs, rewards, terminated, truncated, infos = envs.step(rollout.actions[t].numpy())
+        assert np.array_equal(rollout.dones[t], terminated | truncated)
+        episodes += int((terminated | truncated).sum())
+        for i in np.flatnonzero(truncated & ~terminated):
+            with torch.no_grad():
+                rewards[i] += 0.99 * agent(torch.from_numpy(infos["final_obs"][i : i + 1]))[1].item()
+            cut_off += 1
+        assert np.allclose(rollout.rewards[t], rewards)
+    with torch.no_grad():
+        assert np.allclose(rollout.values[16], agent(torch.from_numpy(obs))[1])
+    assert cut_off >= 7 and len(rollout.episodes) == episodes
+    assert all(length == 100 and value == 0 for _, value, length in rollout.episodes if value == 0)
+
+
+def test_small_run_leaves_its_records(small_run):
+    rows = (small_run / "updates.csv").read_text().splitlines()
+    assert len(rows) == 7 and rows[0].startswith("global_step,charts/learning_rate,losses/policy_loss")
+    evaluation = json.loads((small_run / "evaluation.json").read_text())
+    assert evaluation["mode"] == "greedy" and 0.7 < evaluation["optimal"] < 0.99 and evaluation["episodes"] == 5
+    assert evaluation["max"] <= 0.991 and json.loads((small_run / "result.json").read_text())["complete"]
+    assert (small_run / "learning_curve.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_demonstrations_are_whole_and_can_be_played_again(small_run):
+    manifest = json.loads((small_run / "demos" / "manifest.json").read_text())
+    assert manifest["env_id"] == "FourRooms11-v0" and len(manifest["files"]) == 3
+    env = method.make_env("FourRooms11-v0")
+    for name in manifest["files"]:
+        with np.load(small_run / "demos" / name) as arrays:
+            episode = dict(arrays)
+        obs, info = env.reset(seed=int(episode["seed"]))
+        for t, action in enumerate(episode["actions"]):
+            assert np.array_equal(obs, episode["observations"][t])
+            assert np.array_equal(info["state"], episode["states"][t]) and info["room"] == episode["rooms"][t]
+            obs, reward, terminated, truncated, info = env.step(int(action))
+            assert reward == episode["rewards"][t]
+        assert np.array_equal(obs, episode["observations"][-1]) and info["room"] == episode["rooms"][-1]
+        assert (terminated, truncated) == (episode["terminated"], episode["truncated"])
+
+
+def test_same_seed_same_bytes_and_another_seed_others(small_run, tmp_path):
+    run(*SMALL, "--run-dir", "again", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(small_run, tmp_path / "again")
+    run(*SMALL, "--run-dir", "other", "--seed", 2, cwd=tmp_path, script=SCRIPT)
+    assert (small_run / "updates.csv").read_bytes() != (tmp_path / "other" / "updates.csv").read_bytes()
+
+
+def assert_same_states(left, right) -> None:
+    for name in ("episodes.csv", "updates.csv", "evaluation.json"):
+        assert (left / name).read_bytes() == (right / name).read_bytes(), name
+    states = [torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (left, right)]
+    for name in ("agent", "collector"):
+        for key, value in states[0][name].items():
+            assert torch.equal(value, states[1][name][key]), (name, key)
+    for number, moments in states[0]["optimizer"]["state"].items():
+        for key, value in moments.items():
+            assert torch.equal(value, states[1]["optimizer"]["state"][number][key]), (number, key)
+
+
+@pytest.mark.parametrize("torn", [False, True])
+def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path, torn):
+    flags = [*SMALL, "--run-dir", "run", "--resume"]
+    run(*flags, "--stop-at", 384, cwd=tmp_path, script=SCRIPT)
+    if torn:  # the one before it is taken; the records are cut back
+        path = tmp_path / "run" / "checkpoint.pt"
+        path.write_bytes(path.read_bytes()[:1000])
+        with open(tmp_path / "run" / "episodes.csv", "a") as file:
+            file.write("999,0,1\n")
+    run(*flags, cwd=tmp_path, script=SCRIPT)
+    assert_same_states(small_run, tmp_path / "run")
+
+
+@needs_compiler
+def test_compiled_and_plain_agree(tmp_path):
+    """The same minibatch, the same parameters: parts of the loss and gradients."""
+    args = small_args(channels=4, hidden_size=16)
+    results = []
+    for compiles in (False, True):
+        torch.manual_seed(0)
+        args.compile = compiles
+        agent = method.Agent(args.frame_side, 3, 4, 16)
+        update = method.Update(agent, args)
+        assert update.is_compiled == compiles
+        rng = np.random.default_rng(0)
+        frames = torch.from_numpy(rng.integers(0, 256, (32, 22, 22, 3), np.uint8))
+        numbers = torch.from_numpy(rng.normal(size=(3, 32)).astype(np.float32))
+        batch = method.Batch(frames, torch.from_numpy(rng.integers(0, 3, 32)), -numbers[0].abs(), *numbers[1:])
+        parts = [update(batch) for _ in range(3)]
+        results.append((torch.stack(parts), torch.cat([value.detach().flatten() for value in agent.parameters()])))
+    assert torch.allclose(results[0][0], results[1][0], atol=1e-4)
+    assert torch.allclose(results[0][1], results[1][1], atol=1e-4)
+
+
+def test_a_folder_of_another_run_is_refused(small_run, tmp_path):
+    words = ["--seed 2 (was 1)", "must be as in"]
+    done = run(*SMALL, "--run-dir", small_run, "--resume", "--seed", 2, cwd=tmp_path, code=2, script=SCRIPT)
+    assert all(word in done.stderr for word in words) and done.stderr.count("\n") == 1
+
+
+def test_parameters_that_explode_end_the_run(tmp_path):
+    flags = [*SMALL[:-1], 1e30, "--max-grad-norm", "inf", "--run-dir", "run"]
+    done = run(*flags, cwd=tmp_path, code=1, script=SCRIPT)
+    assert "no longer finite" in done.stderr and not (tmp_path / "run" / "result.json").exists()
+
+
+def test_copied_alone(small_run, tmp_path):
+    (tmp_path / "mine.py").write_text(SCRIPT.read_text())
+    run(*SMALL, "--run-dir", "run", cwd=tmp_path, script=tmp_path / "mine.py", PYTHONSAFEPATH="1")
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_runs_end_with_the_same_bytes(tmp_path, seed):
+    flags = [*SMALL, "--total-timesteps", 25_600, "--seed", seed]
+    run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 12, seed, SCRIPT)
+    run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(tmp_path / "whole", tmp_path / "run")
+
+
+def test_learning_rate_is_annealed(small_run):
+    rates = [float(line.split(",")[1]) for line in (small_run / "updates.csv").read_text().splitlines()[1:]]
+    assert np.allclose(rates, 0.01 * (1 - np.arange(6) / 6)) and not math.isnan(sum(rates))
