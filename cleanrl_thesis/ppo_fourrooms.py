@@ -135,9 +135,9 @@ class Args:
     """discount factor γ"""
     gae_lambda: float = 0.95
     """λ of the generalised advantage estimation"""
-    num_minibatches: int = 16
+    num_minibatches: int = 64
     """minibatches per update iteration"""
-    update_epochs: int = 2
+    update_epochs: int = 4
     """update iterations per batch"""
     clip_coef: float = 0.2
     """ε of the clipped objective"""
@@ -210,8 +210,8 @@ def complete_args(args: Args) -> Args:
     args.batch_size = args.num_envs * args.num_steps
     divides = args.batch_size % args.num_minibatches == 0
     require(divides, "--num-minibatches", args.num_minibatches, f"must divide the batch of {args.batch_size} steps")
-    allowed = "must leave at least 2 steps in each, for the advantages' deviation"
-    require(args.batch_size > args.num_minibatches, "--num-minibatches", args.num_minibatches, allowed)
+    allowed = "must be at least 2 steps, for the advantages' deviation"
+    require(args.batch_size >= 2, "--num-envs · --num-steps", args.batch_size, allowed)
     args.num_iterations = args.total_timesteps // args.batch_size
     allowed = f"must be at least one batch of {args.batch_size} steps"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
@@ -507,12 +507,16 @@ def orthogonal(layer: nn.Module, gain: float) -> nn.Module:
     return layer
 
 
+OBS_SCALE = 64.0  # grey levels; the agent is a few pixels of 70 levels, the goal of 255
+
+
 class Agent(nn.Module):
     """Policy and value on one trunk: two convolutions, the first over squares of 2 × 2 pixels, and a hidden layer."""
 
     def __init__(self, side: int, num_actions: int, channels: int, hidden_size: int):
         super().__init__()
         gain, cells = math.sqrt(2), side // 2
+        self.register_buffer("obs_mean", torch.zeros(side, side, 3))
         self.trunk = nn.Sequential(
             *(orthogonal(nn.Conv2d(3, channels, 2, 2), gain), nn.ReLU()),
             *(orthogonal(nn.Conv2d(channels, 2 * channels, 3, 1), gain), nn.ReLU()),
@@ -523,8 +527,16 @@ class Agent(nn.Module):
 
     def forward(self, obs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Frames (B, side, side, 3) uint8 -> logits (B, A), values (B,)."""
-        features = self.trunk(obs.permute(0, 3, 1, 2) / 255.0 - 0.5)
+        features = self.trunk(((obs - self.obs_mean) / OBS_SCALE).permute(0, 3, 1, 2))
         return self.actor(features), self.critic(features).squeeze(1)
+
+
+def mean_frame(args: Args) -> torch.Tensor:
+    """The mean of the frames with which episodes can begin, (side, side, 3): what of a frame says nothing."""
+    task = maze(ROOM_SIZES[args.env_id])
+    starts = task.starts[:: max(1, len(task.starts) // 20_000)]
+    frames = painter(task.size, args.frame_side).draw(starts[:, 0], starts[:, 1])
+    return torch.from_numpy(frames.mean(0, dtype=np.float64).astype(np.float32))
 
 
 def sample_actions(logits: torch.Tensor, generator: torch.Generator | None = None) -> torch.Tensor:
@@ -648,11 +660,16 @@ class Batch(NamedTuple):
 
 
 def make_batch(rollout: Rollout, args: Args, device: torch.device) -> Batch:
-    """Estimate the advantages of a rollout, and flatten it."""
+    """Estimate the advantages of a rollout, and flatten it.
+
+    Advantages are normalised over the whole batch: at first most minibatches hold no reward, and alone each would blow up
+    the value function's noise.
+    """
     advantages = gae(rollout.rewards, rollout.values, rollout.dones, args.gamma, args.gae_lambda)
     b_advantages, b_returns = (
         torch.from_numpy(array).to(device).flatten() for array in (advantages, advantages + rollout.values[:-1])
     )
+    b_advantages = (b_advantages - b_advantages.mean()) / (b_advantages.std() + 1e-8)
     return Batch(*(column.flatten(0, 1) for column in rollout[:3]), b_advantages, b_returns)
 
 
@@ -665,9 +682,7 @@ def ppo_loss(
     logratio = log_policy.gather(1, minibatch.actions[:, None]).squeeze(1) - minibatch.logprobs
     ratio = logratio.exp()
     clipped_ratio = ratio.clamp(1 - clip_coef, 1 + clip_coef)
-    std, center = torch.std_mean(minibatch.advantages)
-    advantages = (minibatch.advantages - center) / (std + 1e-8)
-    pg_loss = -torch.min(advantages * ratio, advantages * clipped_ratio).mean()
+    pg_loss = -torch.min(minibatch.advantages * ratio, minibatch.advantages * clipped_ratio).mean()
     v_loss = 0.5 * (values - minibatch.returns).square().mean()
     entropy = -(log_policy.exp() * log_policy).sum(1).mean()
     loss = pg_loss + vf_coef * v_loss - ent_coef * entropy
@@ -1118,6 +1133,7 @@ def main(args: Args) -> int:
 
     collector = Collector(args, device)
     agent = Agent(args.frame_side, 3, args.channels, args.hidden_size).to(device)
+    agent.obs_mean.copy_(mean_frame(args))
     update = Update(agent, args)
     iteration, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}
     if checkpoint is not None:

@@ -56,8 +56,7 @@ def test_ppo_loss_against_categorical():
     batch = method.Batch(torch.zeros(64, 1), actions, old.log_prob(actions), advantages, returns)
     loss, (pg_loss, v_loss, entropy, kl, clipfrac) = method.ppo_loss(logits, values, batch, 0.2, 0.01, 0.5)
     ratio = (new.log_prob(actions) - old.log_prob(actions)).exp()
-    normalised = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-    terms = [min(float(a * r), float(a * min(max(r, 0.8), 1.2))) for a, r in zip(normalised, ratio)]
+    terms = [min(float(a * r), float(a * min(max(r, 0.8), 1.2))) for a, r in zip(advantages, ratio)]
     assert pg_loss.item() == pytest.approx(-np.mean(terms), rel=1e-4)
     assert v_loss.item() == pytest.approx(0.5 * torch.nn.functional.mse_loss(values, returns).item())
     assert entropy.item() == pytest.approx(new.entropy().mean().item(), rel=1e-5)
@@ -100,6 +99,11 @@ def test_a_rollout_is_what_the_games_gave():
         assert np.allclose(rollout.rewards[t], rewards)
     with torch.no_grad():
         assert np.allclose(rollout.values[16], agent(torch.from_numpy(obs))[1])
+    batch = method.make_batch(rollout, args, device)
+    advantages = method.gae(rollout.rewards, rollout.values, rollout.dones, args.gamma, args.gae_lambda).ravel()
+    assert np.allclose(batch.returns, advantages + rollout.values[:-1].ravel(), atol=1e-6)
+    assert np.allclose(batch.advantages, (advantages - advantages.mean()) / advantages.std(ddof=1), atol=1e-4)
+    assert torch.equal(batch.obs[9], rollout.obs[1, 1]) and batch.logprobs[9] == rollout.logprobs[1, 1]
     assert cut_off >= 7 and len(rollout.episodes) == episodes
     assert all(length == 100 and value == 0 for _, value, length in rollout.episodes if value == 0)
 

@@ -69,7 +69,7 @@ BAD_ROOMS = [
     (["--frame-side", 21], ["--frame-side", "21", "even"]),
     (["--frame-side", 256], ["--frame-side", "256", "128"]),
     (["--num-minibatches", 7], ["--num-minibatches", "7", "divide"]),
-    (["--num-envs", 4, "--num-steps", 4], ["--num-minibatches", "16", "2 steps"]),
+    (["--num-envs", 1, "--num-steps", 1, "--num-minibatches", 1], ["--num-envs", "1", "at least 2"]),
     (["--total-timesteps", 100], ["--total-timesteps", "100", "16384"]),
     (["--demo-mode", "best"], ["--demo-mode", "best"]),
     (["--ent-coef", "-1"], ["--ent-coef", "-1.0"]),
