@@ -115,7 +115,7 @@ class Args:
     # Algorithm
     env_id: Literal["FourRooms11-v0", "FourRooms19-v0"] = "FourRooms11-v0"
     """the maze of 11 × 11 or of 19 × 19 cells"""
-    total_timesteps: int = 2_000_000
+    total_timesteps: int = 3_000_000
     """environment steps, rounded down to whole batches"""
     frame_side: int | None = None
     """pixels of the side of the frames that the agent sees; default: two for each cell (demonstrations have 64)"""
