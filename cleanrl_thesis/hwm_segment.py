@@ -509,7 +509,7 @@ class HWM(nn.Module):
         """Bernoulli samples of logits (T, B) by the binary Gumbel trick, with the gradient of the soft ones."""
         uniform = torch.rand_like(logits).clamp(1e-6, 1 - 1e-6)
         soft = torch.sigmoid((logits + torch.logit(uniform)) / temperature)
-        return (soft > 0.5).float() + soft - soft.detach()
+        return (soft > 0.5).float() + (soft - soft.detach())
 
     def start(self, batch: int, like: torch.Tensor) -> Belief:
         args = self.args

@@ -11,7 +11,7 @@ METHODS = sorted(
 # (name, file): one line that says why it differs there; files with the same line have to be equal
 PPO, DQN, DISTILL = "ppo_continuous_kle.py", "dqn_apple.py", "distill_hybrid.py"
 DDPG, GAIL = "ddpg_torcs_like.py", "gail_hybrid.py"
-ROOMS = "ppo_fourrooms.py"
+ROOMS, HWM = "ppo_fourrooms.py", "hwm_segment.py"
 DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's two files
     "FPS": "control steps a second",
     "make_env": "bounded Box actions, and the options of the driving task",
@@ -62,6 +62,13 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("record_video", ROOMS): "frames of the agent's own size",
     ("save_demonstrations", ROOMS): "draws the frames of the states",
     ("write_demonstrations", ROOMS): "compressed",
+    ("Episode", HWM): "a recorded one",
+    ("LOG_INTERVAL", HWM): "updates, not environment steps",
+    ("fingerprint", HWM): "frames and actions",
+    ("mlp", HWM): "ELU, torch's own initialisation",
+    ("read_demonstrations", HWM): "any environment with rooms",
+    ("read_episode", HWM): "images, states and rooms",
+    ("split_episodes", HWM): "by pairs",
 }
 OWN = {  # each method's own by design
     *("Args", "Agent", "complete_args", "main", "evaluate", "finish_run", "plot_learning_curve", "print_table"),

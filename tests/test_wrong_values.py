@@ -7,6 +7,7 @@ from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_apple as dqn
 from cleanrl_thesis import gail_hybrid as gail
+from cleanrl_thesis import hwm_segment as hwm
 from cleanrl_thesis import ppo_fourrooms as rooms
 
 BAD_DQN = [
@@ -77,7 +78,20 @@ BAD_ROOMS = [
     (["--eval-episodes", 0], ["--eval-episodes", "0"]),
     (["--resume"], ["--resume", "--run-dir"]),
 ]
-BAD = {dqn: BAD_DQN, distill: BAD_DISTILL, ddpg: BAD_DDPG, gail: BAD_GAIL, rooms: BAD_ROOMS}
+BAD_HWM = [
+    (["--seed", 2], ["--demos", "ppo_fourrooms.py --save-demos 2600"]),
+    (["--demos", "no/such/folder"], ["--demos", "no/such/folder", "manifest"]),
+    (["--demos", "x", "--budget", 1.5], ["--budget", "1.5", "between 0 and 1"]),
+    (["--demos", "x", "--temperature", 0], ["--temperature", "0.0"]),
+    (["--demos", "x", "--frame-side", 65], ["--frame-side", "65", "64"]),
+    (["--demos", "x", "--chunk-length", 1], ["--chunk-length", "1", "at least 2"]),
+    (["--demos", "x", "--stoch-w", 0], ["--stoch-w", "0"]),
+    (["--demos", "x", "--kl-w-scale", "inf"], ["--kl-w-scale", "inf"]),
+    (["--demos", "x", "--image-scale", "nan"], ["--image-scale", "nan"]),
+    (["--demos", "x", "--no-such-flag"], ["--no-such-flag"]),
+    (["--demos", "x", "--resume"], ["--resume", "--run-dir"]),
+]
+BAD = {dqn: BAD_DQN, distill: BAD_DISTILL, ddpg: BAD_DDPG, gail: BAD_GAIL, rooms: BAD_ROOMS, hwm: BAD_HWM}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,449 @@
+"""The hierarchical world model: its distributions, COPY and UPDATE, boundaries and measures, against independent sources."""
+
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, flip_a_byte, kill_twice, needs_compiler, rewrite, run
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import mannwhitneyu
+
+from cleanrl_thesis import hwm_segment as method
+from cleanrl_thesis import ppo_fourrooms as rooms
+
+SCRIPT = ROOT / "cleanrl_thesis" / "hwm_segment.py"
+SIZES = {"deter_z": 5, "stoch_z": 3, "deter_w": 6, "stoch_w": 2, "hidden_size": 16}
+SMALL = [
+    *("--train-pairs", 300, "--total-updates", 12, "--checkpoint-interval", 2, "--batch-size", 4, "--chunk-length", 8),
+    *(word for name, value in SIZES.items() for word in (f"--{name.replace('_', '-')}", value)),
+]
+
+
+def search_episode(task: rooms.Maze, steps: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """A shortest way, with now and then a step aside, in the format of the demonstrations."""
+    pose, goal = task.starts[rng.integers(len(task.starts))]
+    poses, actions = [pose], []
+    while poses[-1] // 4 != goal:
+        after = steps[task.moves[poses[-1]], goal]
+        best = rng.choice(np.flatnonzero(after == after.min()))
+        actions.append(int(best if rng.random() > 0.1 else rng.integers(3)))
+        poses.append(task.moves[poses[-1], actions[-1]])
+    poses, goals = np.array(poses), np.full(len(poses), goal)
+    episode = {"observations": rooms.painter(task.size, 64).draw(poses, goals), "actions": np.array(actions)}
+    episode |= {"states": np.stack([poses // 4, poses % 4, goals], 1), "rooms": task.rooms[poses // 4]}
+    return episode | {"rewards": np.zeros(len(actions)), "terminated": np.array(True), "truncated": np.array(False)}
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    """60 episodes of shortest ways."""
+    folder, task, rng = tmp_path_factory.mktemp("demos") / "demos", rooms.maze(11), np.random.default_rng(0)
+    steps = rooms.fewest_steps(task)
+    episodes = [search_episode(task, steps, rng) for _ in range(60)]
+    rooms.write_demonstrations(folder, episodes, {"env_id": "FourRooms11-v0", "player": "search", "mode": "sampled"})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def small_run(demos, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hwm")
+    run(*SMALL, "--demos", demos, "--run-dir", "run", "--save-model", cwd=folder, script=SCRIPT)
+    return folder / "run"
+
+
+def make_args(**changes) -> method.Args:
+    return method.complete_args(method.Args(**{"demos": ROOT, **SIZES, **changes}))
+
+
+def make_model(frame_size: int = 7, **changes) -> method.HWM:
+    torch.manual_seed(0)
+    return method.HWM(make_args(**changes), frame_size, 3)
+
+
+def make_data(lengths: list[list[int]], frame_size: int = 7) -> method.Sequence:
+    """Columns of episodes with the given lengths one after the other, random frames and actions."""
+    torch.manual_seed(1)
+    first = torch.tensor([[float(t == 0) for n in column for t in range(n)] for column in lengths]).T
+    return method.Sequence(torch.randn(*first.shape, frame_size), torch.randint(3, first.shape), first)
+
+
+def test_kl_terms_are_those_of_torch_distributions():
+    torch.manual_seed(0)
+    q, p = (method.Normal(torch.randn(4, 5), torch.rand(4, 5) + 0.1) for _ in range(2))
+    expected = torch.distributions.kl_divergence(torch.distributions.Normal(*q), torch.distributions.Normal(*p)).sum(-1)
+    assert torch.allclose(method.kl_normal(q, p), expected, rtol=1e-4)
+    logits = torch.randn(2, 50) * 4
+    pair = [torch.distributions.Bernoulli(logits=each) for each in logits]
+    assert torch.allclose(method.kl_bernoulli(*logits), torch.distributions.kl_divergence(*pair), atol=1e-5)
+
+
+def test_balance_weighs_gradients_and_not_the_value():
+    q, p = torch.tensor([0.3], requires_grad=True), torch.tensor([-1.0], requires_grad=True)
+    whole = torch.autograd.grad(method.kl_bernoulli(q, p).sum(), (q, p))
+    value = method.balanced(method.kl_bernoulli, q, p, 0.8)
+    parts = torch.autograd.grad(value.sum(), (q, p))
+    assert value.item() == pytest.approx(method.kl_bernoulli(q, p).item())
+    assert parts[0].item() == pytest.approx(0.2 * whole[0].item(), rel=1e-5)
+    assert parts[1].item() == pytest.approx(0.8 * whole[1].item(), rel=1e-5)
+
+
+def test_standard_deviations():
+    head = method.NormalHead(3, 8, 2, std_bias=-4.0)
+    mean, std = head(torch.randn(100, 3))
+    raw = head.layers(torch.zeros(1, 3))[0, 2:]
+    expected = 2 / (1 + torch.exp(-raw / 2)) + 0.1
+    assert mean.shape == std.shape == (100, 2) and (std > 0.1).all() and (std < 2.1).all()
+    assert torch.allclose(head(torch.zeros(1, 3)).std[0], expected)
+
+
+def test_boundaries_drawn_by_gumbel_noise_have_the_probability_of_their_logit():
+    model = make_model()
+    torch.manual_seed(0)
+    logits = torch.tensor([-2.0, 0.0, 1.5])[:, None].repeat(1, 50_000).requires_grad_()
+    drawn = model.draw_m(logits, 0.5)
+    assert set(drawn.detach().unique().tolist()) <= {0.0, 1.0}
+    assert torch.allclose(drawn.mean(1), torch.sigmoid(logits[:, 0]), atol=0.01)
+    gradient = torch.autograd.grad(drawn.sum(), logits)[0]
+    assert (gradient >= 0).all() and (gradient > 0).float().mean() > 0.5  # of the soft sample
+
+
+@pytest.mark.parametrize("flags", [{}, {"faithful": True}], ids=["default", "faithful"])
+def test_copy_and_update_follow_a_boundary_given_by_hand(flags):
+    """m_t = 1 at t = 1 and 4, an episode begins at 6: z is read at 0, 2, 5 and 6, and copied elsewhere."""
+    model, data = make_model(**flags), make_data([[6, 3]])
+    by_hand = torch.tensor([-1.0, 1, -1, -1, 1, -1, -1, -1, -1])[:, None] * 50
+    model.posterior_m.forward = lambda embed, first: by_hand
+    for mode in ("train", "posterior"):
+        made = model.infer(data, mode)
+        assert made.reads[:, 0].tolist() == [1, 0, 1, 0, 0, 1, 1, 0, 0]
+        assert made.forced[:, 0].tolist() == [1, 0, 0, 0, 0, 0, 1, 0, 0]
+        for level in (made.belief.c, made.belief.v):
+            same = [torch.equal(level[t, 0], level[t - 1, 0]) for t in range(1, 9)]
+            assert same == [True, False, True, True, False, False, True, True]
+        for level in (made.belief.h, made.belief.y):
+            assert not any(torch.equal(level[t, 0], level[t - 1, 0]) for t in range(1, 9))
+
+
+def test_the_prior_segments_by_its_own_boundaries():
+    """Weights set by hand: p(m_t) is near 1 after "forward", else near 0; so z is read one step after each forward."""
+    model, data = make_model(), make_data([[7, 5]])
+    first, middle, last = (layer for layer in model.prior_m if isinstance(layer, torch.nn.Linear))
+    with torch.no_grad():
+        for layer in (first, middle, last):
+            layer.weight.zero_()
+            layer.bias.zero_()
+        first.weight[0, -1] = 1  # the action "forward"
+        middle.weight[0, 0] = 1
+        last.weight[0, 0], last.bias[0] = 100, -50
+    actions = torch.tensor([2, 0, 2, 1, 1, 2, 2, 0, 2, 2, 0, 0])[:, None]
+    data = data._replace(actions=actions)
+    made = model.infer(data, "prior")
+    by_hand = [1, 1, 0, 1, 0, 0, 1, 1, 0, 1, 1, 0]  # the episode of 7 steps ends with a forward, the next begins anyway
+    assert made.reads[:, 0].tolist() == by_hand
+    assert torch.equal(model.infer(data, "sampled").reads, made.reads)  # certain: drawn it is the same
+    assert (made.p_m[:, 0] > 0).tolist() == (actions[:, 0] == 2).tolist()
+
+
+def test_posterior_and_prior_boundaries_are_paired_at_the_same_step():
+    """KL_m at t compares q(m_t | O) with p(m_t | w_t, z_t, a_t); not at the end, nor before an episode's first step."""
+    model, data = make_model(max_segment_length=0, kl_balance=0.5), make_data([[4, 3]])
+    logits = torch.linspace(-3, 3, 7)[:, None]
+    model.posterior_m.forward = lambda embed, first: logits
+    torch.manual_seed(2)
+    made = model.infer(data, "train")
+    torch.manual_seed(2)
+    _, terms = method.hwm_loss(model, data, 1.0, 1.0)
+    q, p = (torch.distributions.Bernoulli(logits=each) for each in (logits, made.p_m))
+    kl = torch.distributions.kl_divergence(q, p)[:, 0]
+    counted = [0, 1, 2, 4, 5]  # m_3 and m_6 decide nothing: steps 4 and 7 begin an episode and lie outside
+    assert terms["kl_m"].item() == pytest.approx(kl[counted].sum().item() / 7, rel=1e-4)
+
+
+def test_loss_is_the_sum_of_its_terms():
+    """Eq. 3.3.5, term by term, with torch.distributions: KL_z where z is read, KL_w at each step."""
+    model, data = make_model(faithful=True, image_scale=2.0), make_data([[5, 4], [9]])
+    torch.manual_seed(3)
+    made = model.infer(data, "train", 0.7)
+    torch.manual_seed(3)
+    loss, terms = method.hwm_loss(model, data, 0.7, 1.0)
+    normal, kl = torch.distributions.Normal, torch.distributions.kl_divergence
+    kl_z = made.reads * kl(normal(*made.q_z), normal(*model.prior_z(made.belief.c))).sum(-1)
+    kl_w = kl(normal(*made.q_w), normal(*model.prior_w(made.belief.h))).sum(-1)
+    reconstruction = (data.frames - model.decode(made.belief)).square().sum(-1)  # 0.5 · image_scale = 1
+    for name, value in (("kl_z", kl_z), ("kl_w", kl_w), ("reconstruction", reconstruction)):
+        assert terms[name].item() == pytest.approx(value.mean().item(), rel=1e-4), name
+    total = terms["reconstruction"] + 0.1 * terms["kl_z"] + 0.1 * terms["kl_w"] + terms["kl_m"]
+    assert loss.item() == pytest.approx(total.item(), rel=1e-5)
+
+
+def test_prices_of_reads():
+    data = make_data([[9], [9]])
+    torch.manual_seed(4)
+    plain, terms = method.hwm_loss(make_model(budget_price=0.0), data, 1.0, 0.25)
+    rate = terms["read_rate"].item()
+    assert rate > 0.25
+    torch.manual_seed(4)
+    priced, _ = method.hwm_loss(make_model(budget_price=10.0, read_price=3.0), data, 1.0, 0.25)
+    torch.manual_seed(4)  # the model's weights are drawn before the noise
+    plain, _ = method.hwm_loss(make_model(budget_price=0.0), data, 1.0, 0.25)
+    torch.manual_seed(4)
+    priced, _ = method.hwm_loss(make_model(budget_price=10.0, read_price=3.0), data, 1.0, 0.25)
+    assert priced.item() - plain.item() == pytest.approx(10 * (rate - 0.25) + 3 * rate, rel=1e-3)
+
+
+@pytest.mark.parametrize("faithful", [False, True])
+def test_nothing_leaks_over_the_border_of_an_episode(faithful):
+    """Other frames and actions in the second episode of a column change nothing in the first, nor in other columns."""
+    model, data = make_model(faithful=faithful), make_data([[6, 5], [11]])
+    frames, actions = data.frames.clone(), data.actions.clone()
+    frames[6:, 0], actions[6:, 0] = torch.randn(5, 7), (actions[6:, 0] + 1) % 3
+    for mode in ("posterior", "prior"):
+        one, other = model.infer(data, mode), model.infer(data._replace(frames=frames, actions=actions), mode)
+        for left, right in zip(
+            (*one.belief, one.q_m, one.p_m, one.reads), (*other.belief, other.q_m, other.p_m, other.reads)
+        ):
+            assert torch.equal(left[:6, 0], right[:6, 0]) and torch.equal(left[:, 1], right[:, 1])
+        assert not torch.equal(one.q_m[6:, 0], other.q_m[6:, 0])
+    frames, actions = data.frames.clone(), data.actions.clone()
+    frames[:6, 0], actions[:6, 0] = torch.randn(6, 7), (actions[:6, 0] + 1) % 3
+    one, other = model.infer(data, "prior"), model.infer(data._replace(frames=frames, actions=actions), "prior")
+    for left, right in zip((*one.belief, one.q_m), (*other.belief, other.q_m)):
+        assert torch.equal(left[6:, 0], right[6:, 0])
+
+
+def test_the_temporal_convolution_sees_three_steps_to_each_side():
+    model, data = make_model(boundary_bound=0.0), make_data([[15]])
+    embed = torch.randn(15, 1, 16, requires_grad=True)
+    model.posterior_m(embed, data.first)[7].sum().backward()
+    seen = embed.grad.abs().sum((1, 2)) > 0
+    assert seen.tolist() == [4 <= t <= 10 for t in range(15)]
+
+
+def test_long_segments_are_cut_in_training_only():
+    model, data = make_model(max_segment_length=4), make_data([[12]])
+    model.posterior_m.forward = lambda embed, first: torch.full((12, 1), -50.0)
+    made = model.infer(data, "train")
+    assert made.reads[:, 0].tolist() == [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]
+    assert made.forced[:, 0].tolist() == made.reads[:, 0].tolist()
+    assert model.infer(data, "posterior").reads[:, 0].tolist() == [1] + [0] * 11
+
+
+def test_z_of_the_prior_needs_no_frame_after_the_first():
+    """Section 3.5.1: only w sees the frames; with actions and boundaries as before, c at the second read is what w made it."""
+    model, data = make_model(), make_data([[8]])
+    made = model.infer(data, "prior")
+    for t in range(1, 8):
+        expected = model.prior_z(made.belief.c[t]).mean if made.reads[t, 0] else made.belief.v[t - 1]
+        assert torch.allclose(made.belief.v[t], expected, atol=1e-6)
+
+
+def test_the_decoder_is_blind_to_h_unless_told_otherwise():
+    belief = method.Belief(*(torch.randn(2, SIZES[name]) for name in ("deter_z", "stoch_z", "deter_w", "stoch_w")))
+    other = belief._replace(h=torch.randn(2, SIZES["deter_w"]))
+    for sees in (False, True):
+        model = make_model(decoder_sees_h=sees)
+        assert torch.equal(model.decode(belief), model.decode(other)) == (not sees)
+    zero = method.Belief(*(torch.zeros_like(part) for part in belief))
+    assert torch.equal(model.decode(belief, 0, 0), model.decode(zero))
+    assert torch.equal(model.decode(belief, 1, 0), model.decode(zero._replace(c=belief.c, v=belief.v)))
+
+
+def test_narrow_w():
+    made = make_model(narrow_w=True).infer(make_data([[30]]), "train")
+    assert (made.q_w.mean.abs() <= 1).all() and (made.q_w.std == 0.3).all()
+
+
+@pytest.mark.parametrize("tolerance", [0, 1, 2])
+def test_matching_is_the_largest_one(tolerance):
+    rng = np.random.default_rng(tolerance)
+    for _ in range(200):
+        found, true = rng.random(15) < rng.random(), rng.random(15) < rng.random()
+        a, b = np.flatnonzero(found), np.flatnonzero(true)
+        near = np.abs(a[:, None] - b) <= tolerance
+        rows, columns = linear_sum_assignment(near, maximize=True)
+        assert method.matches(found, true, tolerance) == near[rows, columns].sum()
+
+
+def test_boundary_scores_counted_by_hand():
+    labels = [np.array([0, 0, 4, 2, 2, 2, 2, 2])]  # through the door between t = 1 and t = 3
+    found = [np.array([False, False, True, False, False, True, False])]
+    assert method.merge_doors(labels[0]).tolist() == [0, 0, 0, 2, 2, 2, 2, 2]
+    scores = method.boundary_scores(found, labels)
+    assert scores["precision_8_labels_0"] == 0.5 and scores["recall_8_labels_0"] == 0.5
+    assert scores["f1_4_rooms_0"] == pytest.approx(2 / 3) and scores["recall_4_rooms_0"] == 1
+    assert scores["door_entry_recall"] == 1  # entered at 1, read at 2: one step apart
+    assert scores["read_rate"] == pytest.approx(2 / 7) and scores["segment_length"] == pytest.approx(8 / 3)
+    assert scores["read_rate_inside_rooms"] == pytest.approx(1 / 3)  # of t = 4, 5 and 6
+
+
+def test_floors_are_what_they_say():
+    task, rng = rooms.maze(11), np.random.default_rng(0)
+    steps = rooms.fewest_steps(task)
+    episodes = [search_episode(task, steps, rng) for _ in range(300)]
+    labels, states = ([episode[name][:-1] for episode in episodes] for name in ("rooms", "states"))
+    made = method.floors(labels, states, 0.2, rng)
+    assert made["always"]["read_rate"] == 1 and made["never"]["f1_8_labels_1"] == 0
+    assert made["coin at the model's rate, on moves"]["read_rate"] == pytest.approx(0.2, abs=0.02)
+    assert made["every 3 steps"]["read_rate"] < 1 / 3 and made["at each door"]["door_entry_recall"] == 1
+    published = {
+        "always": 0.37,
+        "every 2 moves": 0.74,
+        "every 3 moves": 0.61,
+        "every move": 0.51,
+    }  # the chapter 3 study
+    for name, value in published.items():
+        assert made[name]["f1_8_labels_1"] == pytest.approx(value, abs=0.06), name
+
+
+def test_area_under_curve_is_mann_whitneys():
+    rng = np.random.default_rng(0)
+    scores, true = rng.integers(0, 6, 200) / 2, rng.random(200) < 0.3
+    expected = mannwhitneyu(scores[true], scores[~true]).statistic / (true.sum() * (~true).sum())
+    assert method.area_under_curve(scores, true) == pytest.approx(expected)
+    assert math.isnan(method.area_under_curve(scores, np.ones(200, bool)))
+
+
+def test_mutual_information():
+    a = np.array([0, 0, 1, 1, 2, 2])
+    assert method.normalised_mutual_information(a, (a + 1) % 3) == pytest.approx(1)
+    assert method.normalised_mutual_information(a, np.zeros(6, int)) == 0
+    independent = np.array(list(itertools.product(range(3), range(2))))
+    assert method.normalised_mutual_information(*independent.T) == pytest.approx(0, abs=1e-12)
+
+
+def test_clusters_and_probes_find_what_is_there():
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 4, 400)
+    x = np.eye(4)[labels] * 10 + rng.normal(size=(400, 4))
+    assert method.normalised_mutual_information(method.k_means(x, 4, rng), labels) > 0.99
+    assert method.linear_probe((x[:200], labels[:200]), (x[200:], labels[200:])) > 0.99
+    noise = rng.normal(size=(400, 4))
+    assert method.linear_probe((noise[:200], labels[:200]), (noise[200:], labels[200:])) < 0.45
+
+
+def test_frames_are_shrunk_and_normalised_back():
+    rng = np.random.default_rng(0)
+    frames = rng.random((5, 4, 4, 3)) * 255
+    normalizer = method.Normalizer(frames.mean(0) / 255, np.array([5, 1, 1], np.float32))
+    x = normalizer.normalize(frames)
+    assert x.shape == (5, 48) and np.allclose(x.mean(0), 0, atol=1e-6)
+    assert np.allclose(normalizer.frames(x), frames / 255, atol=1e-5)
+    assert x.reshape(5, 4, 4, 3)[0, 1, 2, 0] == pytest.approx(
+        5 * (frames[0, 1, 2, 0] - frames[:, 1, 2, 0].mean()) / 255, rel=1e-4
+    )
+
+
+def test_episodes_read_are_those_written(demos):
+    episodes, env_id = method.read_demonstrations(demos, 22)
+    assert env_id == "FourRooms11-v0" and len(episodes) == 60
+    with np.load(demos / "episode_00007.npz") as arrays:
+        states, actions = arrays["states"], arrays["actions"]
+    episode = episodes[7]
+    assert np.array_equal(episode.states, states[:-1]) and np.array_equal(episode.actions, actions)
+    drawn = rooms.painter(11, 22).draw(4 * states[:-1, 0] + states[:-1, 1], states[:-1, 2])
+    assert np.abs(episode.frames - drawn).mean() < 3  # shrunk twice, or at once
+    sequence = method.in_a_row(episodes[:3], method.Normalizer(np.zeros((22, 22, 3)), np.ones(3)))
+    assert (
+        sequence.first.nonzero().flatten().tolist() == np.cumsum([0, *(len(e.actions) for e in episodes[:2])]).tolist()
+    )
+    chunk = sequence.chunks(torch.tensor([3, 0]), 4)
+    assert torch.equal(chunk.frames[2, 0], sequence.frames[5]) and chunk.actions.shape == (4, 2)
+
+
+def test_small_run_leaves_its_records(small_run):
+    segmentation = json.loads((small_run / "segmentation.json").read_text())
+    assert {"prior", "sampled", "posterior", "floors", "episodes"} <= set(segmentation)
+    assert set(segmentation["prior"]["probes"]) == {"room", "cell", "direction", "goal"}
+    assert segmentation["floors"]["at each door"]["door_entry_recall"] == 1
+    assert json.loads((small_run / "result.json").read_text())["complete"]
+    for name in ("figure_3_4.png", "model.safetensors", "updates.csv", "checkpoint.pt"):
+        assert (small_run / name).stat().st_size > 0, name
+
+
+def assert_same_states(left, right) -> None:
+    for name in ("updates.csv", "segmentation.json", "figure_3_4.png"):
+        assert (left / name).read_bytes() == (right / name).read_bytes(), name
+    states = [torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (left, right)]
+    for key, value in states[0]["model"].items():
+        assert torch.equal(value, states[1]["model"][key]), key
+    for number, moments in states[0]["optimizer"]["state"].items():
+        for key, value in moments.items():
+            assert torch.equal(value, states[1]["optimizer"]["state"][number][key]), (number, key)
+
+
+def test_a_stopped_run_goes_on_to_the_same_bytes(demos, small_run, tmp_path):
+    flags = [*SMALL, "--demos", demos, "--run-dir", "run", "--resume"]
+    run(*flags, "--stop-at", 5, cwd=tmp_path, script=SCRIPT)
+    path = tmp_path / "run" / "checkpoint.pt"
+    path.write_bytes(path.read_bytes()[:1000])  # torn: the one before it is taken
+    run(*flags, cwd=tmp_path, script=SCRIPT)
+    assert_same_states(small_run, tmp_path / "run")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_killed_runs_end_with_the_same_bytes(demos, tmp_path, seed):
+    flags = [*SMALL, "--total-updates", 300, "--seed", seed, "--demos", str(demos)]
+    run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 15, seed, SCRIPT)
+    run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(tmp_path / "whole", tmp_path / "run")
+
+
+def test_other_demonstrations_are_refused_on_resume(demos, small_run, tmp_path):
+    other = tmp_path / "demos"
+    other.mkdir()
+    for path in demos.iterdir():
+        (other / path.name).write_bytes(path.read_bytes())
+    rewrite(other, lambda arrays: {**arrays, "actions": (arrays["actions"] + 1) % 3})
+    done = run(*SMALL, "--demos", other, "--run-dir", small_run, "--resume", cwd=tmp_path, code=2, script=SCRIPT)
+    assert "no longer those" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (flip_a_byte, ["SHA-256"]),
+        (lambda folder: rewrite(folder, lambda a: {k: v for k, v in a.items() if k != "rooms"}), ["rooms"]),
+        (lambda folder: rewrite(folder, lambda a: {**a, "states": a["states"][:-1]}), ["T + 1"]),
+        (lambda folder: rewrite(folder, lambda a: {**a, "observations": a["observations"] / 255}), ["uint8"]),
+        (lambda folder: (folder / "episode_00000.npz").unlink(), ["cannot be read"]),
+        (lambda folder: (folder / "manifest.json").write_text("{}"), ["manifest.json"]),
+    ],
+)
+def test_damaged_demonstrations_are_refused(demos, tmp_path, change, words):
+    folder = tmp_path / "demos"
+    folder.mkdir()
+    for path in demos.iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    change(folder)
+    done = run(*SMALL, "--demos", folder, "--run-dir", "run", cwd=tmp_path, code=2, script=SCRIPT)
+    assert done.stderr.count("\n") == 1 and all(word in done.stderr for word in ["--demos", *words]), done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+@needs_compiler
+def test_compiled_and_plain_agree(monkeypatch):
+    """The same noise: losses and gradients."""
+    args, data = make_args(batch_size=2, chunk_length=4), make_data([[4], [4]])
+    model = make_model(batch_size=2, chunk_length=4)
+    row = method.Sequence(data.frames.flatten(0, 1), data.actions.flatten(), data.first.flatten())
+    results = []
+    for compiles in (False, True):
+        assert not compiles or method.compile_step(model, row, args)
+        torch.manual_seed(5)
+        model.zero_grad()
+        loss, _ = method.hwm_loss(model, data, 0.8, 0.5)
+        loss.backward()
+        results.append([loss.detach(), *(p.grad for p in model.parameters() if p.grad is not None)])
+    for plain, compiled in zip(*results):
+        assert torch.allclose(plain, compiled, atol=1e-4, rtol=1e-3)
+
+
+def test_copied_alone(demos, small_run, tmp_path):
+    (tmp_path / "mine.py").write_text(SCRIPT.read_text())
+    run(*SMALL, "--demos", demos, "--run-dir", "run", cwd=tmp_path, script=tmp_path / "mine.py", PYTHONSAFEPATH="1")
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
