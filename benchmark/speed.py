@@ -5,14 +5,16 @@
     python benchmark/speed.py apple                                # the game alone, and DQN on it; about 3 minutes
     python benchmark/speed.py torcs                                # the simulator alone, and DDPG on it; about 12 minutes
     python benchmark/speed.py gail                                 # GAIL beside TRPO without it; about 3 minutes
+    python benchmark/speed.py rooms                                # FourRooms beside MiniGrid; about a minute
 
-Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,torcs,gail}.json` and `.md`: the median of each contender and of its ratios to
+Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,torcs,gail,rooms}.json` and `.md`: the median of each contender and of its ratios to
 the peer, round by round, with their range. The ratios are the result: the machine's own speed drifts.
 """
 
 import json
 import os
 import platform
+import resource
 import statistics
 import subprocess
 import sys
@@ -30,7 +32,7 @@ PEER = "stable-baselines3"
 
 @dataclass
 class Args:
-    what: tyro.conf.Positional[Literal["ppo", "apple", "torcs", "gail"]]
+    what: tyro.conf.Positional[Literal["ppo", "apple", "torcs", "gail", "rooms"]]
     """what to time"""
     rounds: int = 4
     """how often each contender runs, in turn"""
@@ -220,8 +222,52 @@ def time_gail(args: Args) -> None:
         write_results(args, "gail", "", [measure(work, contenders, args.rounds)])
 
 
+def rooms_contenders(work: Work) -> dict:
+    """Frames of the whole maze at each step: MiniGrid's own (19 × 19), and ours one by one and side by side."""
+    import gymnasium as gym
+    import minigrid.wrappers
+
+    name = f"cleanrl_thesis.ppo_fourrooms:{work.env_id}"
+
+    def minigrids() -> gym.Env:
+        return minigrid.wrappers.RGBImgObsWrapper(gym.make("MiniGrid-FourRooms-v0", highlight=False))
+
+    def single(env: gym.Env, steps: int) -> dict[str, float]:
+        env.action_space.seed(1)
+        env.reset(seed=1)
+        start = time.perf_counter()
+        for _ in range(steps):
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            if terminated or truncated:
+                env.reset()
+        return {"steps_per_second": steps / (time.perf_counter() - start), "peak_memory_mb": peak_memory()}
+
+    def many(games: int) -> dict[str, float]:
+        speed = time_environment(name, games, work.steps // games, 1)[0]
+        return {"steps_per_second": speed, "peak_memory_mb": peak_memory()}
+
+    return {
+        "MiniGrid, RGBImgObsWrapper": lambda: single(minigrids(), 1_000),
+        "one game": lambda: single(gym.make(name, disable_env_checker=True), 5_000),
+        "64 games": lambda: many(64),
+        "256 games": lambda: many(256),
+    }
+
+
+def peak_memory() -> float:
+    """Of this process so far, in MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def time_rooms(args: Args) -> None:
+    works = [Work(f"FourRooms{size}-v0", None, 256 * 1_000) for size in (11, 19)]
+    write_results(args, "rooms", "", [measure(work, rooms_contenders(work), args.rounds) for work in works])
+
+
 if __name__ == "__main__":
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # before numpy is imported
     arguments = tyro.cli(Args)
-    {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail}[arguments.what](arguments)
+    {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail, "rooms": time_rooms}[arguments.what](
+        arguments
+    )
