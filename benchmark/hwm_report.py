@@ -1,0 +1,142 @@
+"""The world model alone: runs of benchmark/hwm_segment.sh -> one table of the rungs beside segmentations that know nothing.
+
+    python benchmark/hwm_report.py        # runs/hwm_segment -> benchmark/results/hwm_segment
+
+Takes whatever part of the runs is done. Means over seeds, with 95% t-intervals where there are several.
+"""
+
+import json
+import re
+import shutil
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from common import ROOT, commit, commit_of, write_csv
+from scipy import stats
+
+RUNGS = {
+    "faithful": "(a) Eq. 3.3.1 to 3.3.7",
+    "kl_w": "(b) KL_w ten times",
+    "reset": "(c) w reset where z is read",
+    "price": "(d) a price for each read",
+    "narrow": "(e) narrow w, reset, budget",
+    "no_budget": "(e) without the budget",
+}
+MEASURES = {
+    "f1_8_labels_0": "F1, 8 labels, exact",
+    "f1_8_labels_1": "± 1 step",
+    "f1_4_rooms_0": "F1, 4 rooms, exact",
+    "f1_4_rooms_1": "± 1 step",
+    "read_rate": "reads",
+    "door_entry_recall": "doors found",
+    "read_rate_inside_rooms": "reads inside rooms",
+    "area_under_curve_8_labels": "AUC",
+    "mutual_information_z_room": "z's clusters and rooms",
+    "reconstruction_mse": "MSE",
+}
+IGNORANT = r"always|never|coin.*|every .*"  # floors; "at each door" knows the doors
+
+
+@dataclass
+class Args:
+    runs: Path = Path("runs/hwm_segment")
+    """folder of the runs' folders"""
+    out: Path = ROOT / "benchmark" / "results" / "hwm_segment"
+    """folder for the table, the runs and the figures"""
+
+
+def read_runs(folder: Path) -> list[dict]:
+    """One row for each finished run: rung, seed, how m was found, and its measures."""
+    rows = []
+    for path in sorted(folder.glob("*/result.json")):
+        result, name = json.loads(path.read_text()), path.parent.name
+        if not result["complete"]:
+            continue
+        segmentation = json.loads((path.parent / "segmentation.json").read_text())
+        best = {
+            key: max(floor[key] for name, floor in segmentation["floors"].items() if re.fullmatch(IGNORANT, name))
+            for key in MEASURES
+            if key.startswith("f1")
+        }
+        about = {"rung": re.sub(r"_seed\d+$", "", name), "seed": result["seed"], "run": name}
+        about |= {"script_sha256": result["script_sha256"], "training_seconds": result["training_seconds"]}
+        for mode in ("prior", "sampled", "posterior"):
+            made = segmentation[mode]
+            row = {**about, "m": mode, **{key: made[key] for key in MEASURES}}
+            row["above_all_floors"] = all(made[key] > floor for key, floor in best.items())
+            row |= {f"{what}_from_{level}": value[level] for what, value in made["probes"].items() for level in "zw"}
+            rows.append(row | {f"best_floor_{key}": value for key, value in best.items()})
+    return rows
+
+
+def interval(values: list[float]) -> str:
+    """Mean and the half-width of its 95% t-interval."""
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return f"{mean:.2f}"
+    half = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / len(values) ** 0.5
+    return f"{mean:.2f} ± {half:.2f}"
+
+
+def rung_table(rows: list[dict]) -> list[str]:
+    """The rungs, m from p and from q, with the best floor of the same episodes below."""
+    lines = [f"| rung | m from | seeds | {' | '.join(MEASURES.values())} | above all floors | minutes |"]
+    lines.append("|" + "---|" * (len(MEASURES) + 5))
+    groups = defaultdict(list)
+    for row in rows:
+        groups[row["rung"], row["m"]].append(row)
+    modes = {"prior": "p", "sampled": "p, drawn", "posterior": "q"}
+    for rung, title in RUNGS.items():
+        for mode, m in modes.items():
+            group = groups[rung, mode]
+            if not group:
+                continue
+            cells = [interval([row[key] for row in group]) for key in MEASURES if key != "reconstruction_mse"]
+            cells.append(f"{np.mean([row['reconstruction_mse'] for row in group]):.5f}")
+            above = f"{sum(row['above_all_floors'] for row in group)} of {len(group)}"
+            minutes = np.mean([row["training_seconds"] for row in group]) / 60
+            lines.append(f"| {title} | {m} | {len(group)} | {' | '.join(cells)} | {above} | {minutes:.1f} |")
+    best = [f"{np.mean([row[f'best_floor_{key}'] for row in rows]):.2f}" if key[:2] == "f1" else "" for key in MEASURES]
+    lines.append(f"| best of those that know nothing | | | {' | '.join(best)} | | |")
+    return lines
+
+
+def probe_table(rows: list[dict]) -> list[str]:
+    """What a linear probe reads from z and from w, m from p."""
+    kinds = ("room", "cell", "direction", "goal")
+    lines = [f"| rung | {' | '.join(f'{kind}: z, w' for kind in kinds)} |", "|" + "---|" * (len(kinds) + 1)]
+    for rung, title in RUNGS.items():
+        group = [row for row in rows if row["rung"] == rung and row["m"] == "prior"]
+        if group:
+            pairs = [[np.mean([row[f"{kind}_from_{level}"] for row in group]) for level in "zw"] for kind in kinds]
+            lines.append(f"| {title} | {' | '.join(f'{z:.2f}, {w:.2f}' for z, w in pairs)} |")
+    return lines
+
+
+def write_report(rows: list[dict], runs: Path, out: Path) -> None:
+    """Write table, runs and the figure of each rung's first seed."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_csv(out / "runs.csv", rows)
+    scripts = sorted({commit_of("hwm_segment", row["script_sha256"]) for row in rows})
+    hours = sum(row["training_seconds"] for row in rows) / 3 / 3600
+    text = [f"`benchmark/hwm_segment.sh`, hwm_segment.py at {', '.join(scripts)}; this report at {commit()}. "]
+    text[0] += f"{len(rows) // 3} runs, {hours:.1f} core-hours, one thread each."
+    text += ["", "## Boundaries on held-out episodes", "", *rung_table(rows)]
+    text += ["", "## Accuracy of linear probes, m from p", "", *probe_table(rows)]
+    (out / "table.md").write_text("\n".join(text) + "\n")
+    for rung in RUNGS:
+        first = min((row for row in rows if row["rung"] == rung), key=lambda row: row["seed"], default=None)
+        if first:
+            shutil.copy(runs / first["run"] / "figure_3_4.png", out / f"figure_3_4_{rung}.png")
+    print("\n".join(text))
+
+
+if __name__ == "__main__":
+    arguments = tyro.cli(Args, description=__doc__.split("\n\n")[0])
+    found = read_runs(arguments.runs)
+    if not found:
+        raise SystemExit(f"error: --runs {arguments.runs}: holds no finished run")
+    write_report(found, arguments.runs, arguments.out)

@@ -1,0 +1,32 @@
+#!/usr/bin/env bash
+# The hierarchical world model alone: episodes of PPO, then for each rung of the ladder against collapse a model for each seed;
+# the runs behind benchmark/results/hwm_segment/. Can be sent again after every stop.
+#   benchmark/hwm_segment.sh
+#   SEEDS="1" RUNGS="faithful narrow" benchmark/hwm_segment.sh
+set -euo pipefail
+cd "$(dirname "$0")/.."
+SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
+RUNGS=${RUNGS:-narrow faithful reset kl_w price no_budget} PLAYER=${PLAYER:-runs/fourrooms/11_seed1}
+mkdir -p "$RUNS"
+"$PYTHON" cleanrl_thesis/ppo_fourrooms.py --save-demos 2600 --save-model --run-dir "$PLAYER" --resume
+# what --faithful sets, for the rungs that change one thing of it
+FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
+FAITHFUL+=" --stoch-w 16 --kl-m-scale 1"
+for rung in $RUNGS; do
+  case $rung in
+    narrow) flags="" ;;                                # (e) the default
+    no_budget) flags="--budget-price 0" ;;             # (e) without the budget
+    faithful) flags="--faithful" ;;                    # (a)
+    kl_w) flags="$FAITHFUL --kl-w-scale 1" ;;          # (b) a larger weight of KL_w
+    reset) flags="$FAITHFUL --w-reset" ;;              # (c) w starts anew where z is read
+    price) flags="$FAITHFUL --read-price 10" ;;        # (d) a price for each read
+    *)
+      echo "RUNGS=$RUNGS: must be of narrow, no_budget, faithful, kl_w, reset and price" >&2
+      exit 2
+      ;;
+  esac
+  for seed in $SEEDS; do
+    echo --demos "$PLAYER/demos" --seed "$seed" --run-dir "$RUNS/${rung}_seed$seed" $flags
+  done
+done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/hwm_segment.py --save-model --resume
+"$PYTHON" benchmark/hwm_report.py --runs "$RUNS"
