@@ -168,7 +168,7 @@ class Args:
     """price of a read, on the mean read rate"""
     budget: float = 0.23
     """share of steps read without a price, from 1 over 80% of the updates"""
-    budget_price: float = 10.0
+    budget_price: float = 50.0
     """price of the reads beyond it, on the mean read rate; 0: no budget"""
 
     # to be filled in runtime

@@ -3,6 +3,8 @@
 import itertools
 import json
 import math
+import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +15,9 @@ from scipy.stats import mannwhitneyu
 
 from cleanrl_thesis import hwm_segment as method
 from cleanrl_thesis import ppo_fourrooms as rooms
+
+sys.path.append(str(ROOT / "benchmark"))
+import hwm_report  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "hwm_segment.py"
 SIZES = {"deter_z": 5, "stoch_z": 3, "deter_w": 6, "stoch_w": 2, "hidden_size": 16}
@@ -447,3 +452,27 @@ def test_copied_alone(demos, small_run, tmp_path):
     (tmp_path / "mine.py").write_text(SCRIPT.read_text())
     run(*SMALL, "--demos", demos, "--run-dir", "run", cwd=tmp_path, script=tmp_path / "mine.py", PYTHONSAFEPATH="1")
     assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+
+
+def test_report_of_part_of_the_runs(small_run, tmp_path):
+    """Two seeds of one rung, one of another, and a run that is not done."""
+    for name in ("narrow_seed1", "narrow_seed2", "faithful_seed1", "reset_seed1"):
+        shutil.copytree(small_run, tmp_path / "runs" / name)
+    (tmp_path / "runs" / "reset_seed1" / "result.json").unlink()
+    rows = hwm_report.read_runs(tmp_path / "runs")
+    assert len(rows) == 9 and {row["rung"] for row in rows} == {"narrow", "faithful"}
+    segmentation = json.loads((small_run / "segmentation.json").read_text())
+    ignorant = [floor for name, floor in segmentation["floors"].items() if name != "at each door"]
+    assert rows[0]["best_floor_f1_4_rooms_1"] == max(floor["f1_4_rooms_1"] for floor in ignorant)
+    hwm_report.write_report(rows, tmp_path / "runs", tmp_path / "out")
+    table = (tmp_path / "out" / "table.md").read_text()
+    read_rate = segmentation["prior"]["read_rate"]
+    assert f"{read_rate:.2f} ± 0.00" in table and "(c)" not in table
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+        *("figure_3_4_faithful.png", "figure_3_4_narrow.png", "runs.csv", "table.md")
+    ]
+
+
+def test_interval_of_two_seeds():
+    assert hwm_report.interval([1.0, 2.0]) == "1.50 ± 6.35"  # 12.706 · 0.7071 / √2
+    assert hwm_report.interval([1.0]) == "1.00"
