@@ -768,6 +768,7 @@ def compile_step(model: HWM, data: Sequence, args: Args) -> bool:
         print(f"--compile: no C++ compiler ({compiler}) here, goes on without", file=sys.stderr)
         return False
     plain, state = model.step, torch.get_rng_state()
+    torch.compiler.set_stance("default")
     model.step = torch.compile(plain)
     try:
         starts = torch.zeros(args.batch_size, dtype=torch.int64, device=data.actions.device)

@@ -715,6 +715,7 @@ class Update:
         device = self.agent.critic.weight.device
         frames = torch.zeros(rows, side, side, 3, dtype=torch.uint8, device=device)
         numbers = torch.zeros(rows, device=device)
+        torch.compiler.set_stance("default")
         compiled = torch.compile(self.plain_loss)
         try:  # and changes nothing: the gradients are set to zero before each step
             compiled(Batch(frames, numbers.long(), numbers, numbers, numbers))[0].backward()
