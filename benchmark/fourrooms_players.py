@@ -1,0 +1,62 @@
+"""PPO in FourRooms: runs -> one table of their returns beside the shortest ways from the same starts.
+
+for seed in 1 2 3; do
+  python cleanrl_thesis/ppo_fourrooms.py --seed $seed --save-demos 2600 --save-model --run-dir runs/fourrooms/11_seed$seed
+done
+python benchmark/fourrooms_players.py        # runs/fourrooms -> benchmark/results/fourrooms
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from common import ROOT, commit, commit_of, write_csv
+
+
+@dataclass
+class Args:
+    runs: Path = Path("runs/fourrooms")
+    """folder of the runs' folders"""
+    out: Path = ROOT / "benchmark" / "results" / "fourrooms"
+    """folder for the table"""
+
+
+def read_runs(folder: Path) -> list[dict]:
+    """One row for each run that came to the end of its steps."""
+    rows = []
+    for path in sorted(folder.glob("*/result.json")):
+        result = json.loads(path.read_text())
+        if result["complete"]:
+            greedy = result["evaluation"]
+            row = {"env_id": result["env_id"], "seed": result["seed"], "steps": result["global_step"]}
+            row |= {"minutes": round(result["training_seconds"] / 60, 1), "sampled": result["training"]["mean"]}
+            row |= {"greedy": greedy["mean"], "optimal": greedy["optimal"], "solved": greedy["solved"]}
+            rows.append({**row, "commit": commit_of("ppo_fourrooms", result["script_sha256"])})
+    return rows
+
+
+def table(rows: list[dict]) -> str:
+    """The rows as Markdown, the greedy return as a share of the optimal one beside it."""
+    lines = [
+        "| task | seed | steps | minutes | sampled, last 500 | greedy, 2,000 | shortest ways | share | solved | commit |"
+    ]
+    lines.append("|" + "---|" * 10)
+    for row in rows:
+        share = row["greedy"] / row["optimal"]
+        cells = [row["env_id"], row["seed"], f"{row['steps']:,}", f"{row['minutes']:.0f}", f"{row['sampled']:.3f}"]
+        cells += [f"{value:.3f}" for value in (row["greedy"], row["optimal"], share, row["solved"])]
+        lines.append(f"| {' | '.join(map(str, [*cells, row['commit']]))} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    args = tyro.cli(Args, description=__doc__.split("\n\n")[0])
+    found = read_runs(args.runs)
+    if not found:
+        raise SystemExit(f"error: --runs {args.runs}: holds no finished run")
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_csv(args.out / "players.csv", found)
+    text = f"`benchmark/fourrooms_players.py` at {commit()}; one thread each, beside other processes.\n\n{table(found)}"
+    (args.out / "players.md").write_text(text)
+    print(text)
