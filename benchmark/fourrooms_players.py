@@ -44,7 +44,8 @@ def table(rows: list[dict]) -> str:
     lines.append("|" + "---|" * 10)
     for row in rows:
         share = row["greedy"] / row["optimal"]
-        cells = [row["env_id"], row["seed"], f"{row['steps']:,}", f"{row['minutes']:.0f}", f"{row['sampled']:.3f}"]
+        sampled = "" if row["sampled"] is None else f"{row['sampled']:.3f}"  # no episode came to its end
+        cells = [row["env_id"], row["seed"], f"{row['steps']:,}", f"{row['minutes']:.0f}", sampled]
         cells += [f"{value:.3f}" for value in (row["greedy"], row["optimal"], share, row["solved"])]
         lines.append(f"| {' | '.join(map(str, [*cells, row['commit']]))} |")
     return "\n".join(lines) + "\n"

@@ -1,8 +1,8 @@
 """The hierarchical world model (HWM) alone: reconstruction and segmentation of episodes (thesis section 3.3, Fig. 3.4).
 
     python cleanrl_thesis/ppo_fourrooms.py --save-demos 2600 --run-dir runs/fourrooms11      # the episodes
-    python cleanrl_thesis/hwm_segment.py --demos runs/fourrooms11/demos                      # a model that finds rooms
-    python cleanrl_thesis/hwm_segment.py --demos runs/fourrooms11/demos --faithful           # Eq. 3.3.1 to 3.3.7 and no more
+    python cleanrl_thesis/hwm_segment.py --demos runs/fourrooms11/demos                      # rung (e) of the ladder
+    python cleanrl_thesis/hwm_segment.py --demos runs/fourrooms11/demos --faithful           # rung (a)
 
 It is trained to maximise J_HWM (Eq. 3.3.5) on 25,000 observation-action pairs; the other episodes of the folder are held out,
 and measured as in section 3.5.1: z_0 from q(z), later z from p(z), w from q(w), the boundary m from p(m). `segmentation.json`
@@ -19,7 +19,8 @@ be sent again after every crash: on the same machine the run ends with the same 
 | `--narrow-w`, `--no-decoder-sees-h` | no | yes: the decoder sees z and 4 noisy numbers of w in ±1, else w alone carries all and nothing holds a segment |
 | `--budget` | no | the share of steps that may be read, annealed from all; more costs `--budget-price` each |
 
-`--faithful` is the left column. It collapses: README, "Segments". Frames are shrunk and centred; the agent's red counts more.
+`--faithful`, rung (a) of the ladder against collapse, turns the last three off; the default is rung (e). Frames are shrunk and
+centred, and the agent's red counts more.
 """
 
 # /// script

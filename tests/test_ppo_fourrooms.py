@@ -2,6 +2,8 @@
 
 import json
 import math
+import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -9,6 +11,9 @@ import torch
 from conftest import ROOT, kill_twice, needs_compiler, run
 
 from cleanrl_thesis import ppo_fourrooms as method
+
+sys.path.append(str(ROOT / "benchmark"))
+import fourrooms_players  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "ppo_fourrooms.py"
 # 6 batches of 128 steps, a checkpoint after each
@@ -218,3 +223,13 @@ def test_killed_runs_end_with_the_same_bytes(tmp_path, seed):
 def test_learning_rate_is_annealed(small_run):
     rates = [float(line.split(",")[1]) for line in (small_run / "updates.csv").read_text().splitlines()[1:]]
     assert np.allclose(rates, 0.01 * (1 - np.arange(6) / 6)) and not math.isnan(sum(rates))
+
+
+def test_table_of_the_players(small_run, tmp_path):
+    shutil.copytree(small_run, tmp_path / "runs" / "11_seed1")
+    rows = fourrooms_players.read_runs(tmp_path / "runs")
+    evaluation = json.loads((small_run / "evaluation.json").read_text())
+    assert rows[0]["greedy"] == evaluation["mean"] and rows[0]["steps"] == 768
+    line = fourrooms_players.table(rows).splitlines()[2]
+    assert line.startswith("| FourRooms11-v0 | 1 | 768 | 0 |")
+    assert f"| {evaluation['mean'] / evaluation['optimal']:.3f} |" in line
