@@ -164,7 +164,9 @@ class Args:
     narrow_std: float = 0.3
     """that noise"""
     decoder_sees_h: bool = False
-    """the decoder sees h_t too (Eq. 3.3.1), not only y_t, c_t and v_t"""
+    """the decoder sees h_t too (Eq. 3.3.1), not only y_t and z_t"""
+    decoder_sees_c: bool = True
+    """the decoder sees c_t too (Eq. 3.3.1), not only v_t: c_t knows of frames a step late"""
     read_price: float = 0.0
     """price of a read, on the mean read rate"""
     budget: float = 0.23
@@ -178,7 +180,14 @@ class Args:
 
 
 FAITHFUL = {  # what `--faithful` sets
-    **{"w_reset": False, "narrow_w": False, "decoder_sees_h": True, "detach_kl_z": False, "budget_price": 0.0},
+    **{
+        "w_reset": False,
+        "narrow_w": False,
+        "decoder_sees_h": True,
+        "decoder_sees_c": True,
+        "detach_kl_z": False,
+        "budget_price": 0.0,
+    },
     **{"boundary_bound": 0.0, "read_bias": 0.0, "read_price": 0.0, "stoch_w": 16, "kl_m_scale": 1.0},
 }
 
@@ -584,7 +593,7 @@ class HWM(nn.Module):
     def decode(self, belief: Belief, use_z: float = 1.0, use_w: float = 1.0) -> torch.Tensor:
         """Mean of p(o_t | w_t, z_t), (..., F); 0 turns z or w off (rows b to d of Fig. 3.4)."""
         c, v, h, y = belief
-        h = h if self.args.decoder_sees_h else torch.zeros_like(h)
+        c, h = c * self.args.decoder_sees_c, h * self.args.decoder_sees_h
         return self.decoder(torch.cat([use_z * c, use_z * v, use_w * h, use_w * y], -1))
 
 

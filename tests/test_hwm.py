@@ -245,12 +245,14 @@ def test_z_of_the_prior_needs_no_frame_after_the_first():
         assert torch.allclose(made.belief.v[t], expected, atol=1e-6)
 
 
-def test_the_decoder_is_blind_to_h_unless_told_otherwise():
+@pytest.mark.parametrize("part", ["c", "h"])
+def test_the_decoder_sees_what_it_is_told_to(part):
     belief = method.Belief(*(torch.randn(2, SIZES[name]) for name in ("deter_z", "stoch_z", "deter_w", "stoch_w")))
-    other = belief._replace(h=torch.randn(2, SIZES["deter_w"]))
+    other = belief._replace(**{part: torch.randn_like(getattr(belief, part))})
     for sees in (False, True):
-        model = make_model(decoder_sees_h=sees)
+        model = make_model(**{f"decoder_sees_{part}": sees})
         assert torch.equal(model.decode(belief), model.decode(other)) == (not sees)
+    model = make_model(decoder_sees_c=True, decoder_sees_h=True)
     zero = method.Belief(*(torch.zeros_like(part) for part in belief))
     assert torch.equal(model.decode(belief, 0, 0), model.decode(zero))
     assert torch.equal(model.decode(belief, 1, 0), model.decode(zero._replace(c=belief.c, v=belief.v)))
