@@ -409,7 +409,7 @@ class Normal(NamedTuple):
 
 
 class NormalHead(nn.Module):
-    """Features -> N(μ, σ): σ = 2 sigmoid(x / 2) + 0.1, or with `bound` μ in ±bound and σ the given noise."""
+    """Features -> N(μ, σ) with σ = 2 sigmoid(x / 2) + 0.1, x starting near `std_bias`."""
 
     def __init__(self, input_size: int, hidden_size: int, size: int, std_bias: float):
         super().__init__()
