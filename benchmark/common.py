@@ -32,7 +32,9 @@ def git(*words: str) -> str:
 
 
 def commit() -> str:
-    return git("describe", "--always", "--dirty").strip()
+    """The commit that is checked out, with "-dirty" where a file differs from it that is not itself a result."""
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!benchmark/results")
+    return git("describe", "--always").strip() + ("-dirty" if changed else "")
 
 
 def commit_of(script: str, digest: str) -> str:
