@@ -181,6 +181,12 @@ def select(rows: list[dict], method: str, k: int | None = None, target: float | 
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 
+def on_all_tasks(rows: list[dict], *setting) -> list[dict]:
+    """Rows of a setting that has a run of every task, else none: means over other tasks cannot be compared."""
+    found = select(rows, *setting)
+    return found if {row["task"] for row in found} == {row["task"] for row in rows} else []
+
+
 def by_task(rows: list[dict], column: str) -> Scores:
     scores = defaultdict(list)
     for row in rows:
@@ -221,6 +227,11 @@ def bootstrap(
     drawn = statistic(*(resample(group, rng, stretches) for group in groups))
     low, high = np.percentile(drawn, (2.5, 97.5))
     return float(statistic(*groups)), float(low), float(high)
+
+
+def has_seeds(*groups: Scores) -> bool:
+    """Whether each task of each group has two runs or more, so that there is an interval."""
+    return all(len(values) > 1 for group in groups for values in group.values())
 
 
 def common(*groups: Scores) -> list[Scores]:
@@ -472,14 +483,15 @@ def findings_table(rows: list[dict], definition: str, is_whole: bool) -> list[li
 
 
 def iqm_table(rows: list[dict], column: str) -> list[list[str]]:
-    """Interquartile means with their intervals."""
+    """Interquartile means of the settings that have all tasks, with their intervals where each task has two seeds."""
     lines = [["", *(f"K = {k}" for k in KS)]]
     for method, target in SETTINGS:
         line = [setting_name(method, target)]
         for k in KS:
-            scores = by_task(select(rows, method, k, target), column)
+            scores = by_task(on_all_tasks(rows, method, k, target), column)
             middle, low, high = bootstrap(interquartile_mean, scores, stretches=False) if scores else (0, 0, 0)
-            line.append(f"{middle:.2f} [{low:.2f}, {high:.2f}]" if scores else "")
+            interval = f" [{low:.2f}, {high:.2f}]" if has_seeds(scores) else ""
+            line.append(f"{middle:.2f}{interval}" if scores else "")
         lines.append(line)
     return lines
 
@@ -586,19 +598,22 @@ def figure_4_1(runs: list[dict], column: str, steps: int) -> Figure:
 
 
 def figure_4_2(rows: list[dict], column: str) -> Figure:
-    """NER of every setting; bars are means over the K that all d_target have, dots each K, the least on the left."""
+    """NER of the settings that have all tasks; bars are means over the K that all d_target have, dots each K from the left."""
     title = "Fig. 4.2: K of plain PPO beside d_target of the early stops (dots: each K, from the left)"
     figure, axes = new_figure(title, 1, 3, 12, 3.6)
     axes[0, 0].set_ylabel("NER")
     for panel, method in zip(axes[0], METHODS):
-        targets = [None] if method == "PPO" else [t for t in TARGETS if select(rows, method, None, t)]
-        ks = [k for k in KS if targets and all(select(rows, method, k, target) for target in targets)]
+        targets = (
+            [None] if method == "PPO" else [t for t in TARGETS if any(on_all_tasks(rows, method, k, t) for k in KS)]
+        )
+        ks = [k for k in KS if targets and all(on_all_tasks(rows, method, k, target) for target in targets)]
         bars = [[(None, k)] for k in ks] if method == "PPO" else [[(target, k) for k in ks] for target in targets]
         for x, bar in enumerate(bars if ks else []):
             groups = [by_task(select(rows, method, k, target), column) for target, k in bar]
             middle, low, high = bootstrap(lambda *each: np.mean([*map(mean_of_tasks, each)], 0), *groups)
             panel.bar(x, middle, color=COLOURS[method], alpha=0.6)
-            panel.errorbar(x, middle, [[max(0, middle - low)], [max(0, high - middle)]], color="black", capsize=3)
+            if has_seeds(*groups):
+                panel.errorbar(x, middle, [[max(0, middle - low)], [max(0, high - middle)]], color="black", capsize=3)
             for (_, k), group in zip(bar if method != "PPO" else [], groups):
                 panel.plot(x + (KS.index(k) - 2) * 0.15, mean_of_tasks(group), "o", color="black", markersize=2.5)
         names = [f"K = {k}" for k in ks] if method == "PPO" else [f"{target:g}" for target in targets]
@@ -665,11 +680,12 @@ def curves_figure(runs: list[dict], steps: int) -> Figure:
 
 
 def heat_map(rows: list[dict], column: str) -> Figure:
-    """NER of K × d_target for each early stop, beside plain PPO."""
+    """NER of K × d_target for each early stop, beside plain PPO; of the settings that have all tasks."""
     figure, axes = new_figure("NER by K and d_target", 1, 2, 10, 3.6)
     for panel, method in zip(axes[0], ("stop", "rollback")):
         names = ["PPO", *map(str, TARGETS)]
-        groups = [[select(rows, "PPO", k) for k in KS], *([select(rows, method, k, t) for k in KS] for t in TARGETS)]
+        settings = [[("PPO", k) for k in KS], *([(method, k, target) for k in KS] for target in TARGETS)]
+        groups = [[on_all_tasks(rows, *setting) for setting in line] for line in settings]
         table = np.array(
             [[mean_of_tasks(by_task(each, column)) if each else np.nan for each in line] for line in groups]
         )
