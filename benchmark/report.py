@@ -631,7 +631,7 @@ def task_figures(runs: list[dict], steps: int) -> dict[str, Figure]:
         tasks = [task for task in TASKS[begin : begin + 3] if any(row["task"] == task for row in rows)]
         if not tasks:
             continue
-        title = f"Fig. 4.{3 + number}, {steps:,} steps: means, and ranges over seeds; early stops with 0.03"
+        title = f"Fig. 4.{3 + number}, {steps:,} steps\nmeans, and ranges over seeds; early stops with 0.03"
         figure, axes = new_figure(title, len(measures), len(tasks), 3.6 * len(tasks) + 1, 9)
         for column, task in enumerate(tasks):
             for panel, (measure, name) in zip(axes[:, column], measures.items()):

@@ -260,3 +260,15 @@ def test_cost_is_that_of_the_study_s_iterations():
     hours = 2 * 2e6 * sum(1e-4 + 2e-5 * each for each in iterations) / 3600
     assert lines["Ant-v2"][2:4] == ["100.0", "20.00"] and float(lines["Ant-v2"][-1]) == pytest.approx(hours, abs=0.06)
     assert lines["sum of 1 of 11 tasks"][-1] == lines["Ant-v2"][-1] and "Hopper-v2" not in lines
+
+
+def test_a_setting_without_all_tasks_is_compared_with_none(rows):
+    """KLE-Stop 0.05 at K = 80 on one task of two: not in the interquartile means; of one seed there is no interval."""
+    part = [row for row in rows if (row["K"], row["d_target"], row["task"]) != (80, 0.05, "Hopper-v2")]
+    part = [row for row in part if row["K"] != 20 or row["seed"] == 1]
+    assert report.on_all_tasks(rows, "stop", 80, 0.05) and not report.on_all_tasks(part, "stop", 80, 0.05)
+    lines = {line[0]: line[1:] for line in report.iqm_table(part, "as written")}
+    assert lines["KLE-Stop, d_target = 0.05"][4] == "" and "[" in lines["KLE-Stop, d_target = 0.05"][1]
+    assert "[" not in lines["PPO"][2] and float(lines["PPO"][2]) > 0
+    before, after = (report.heat_map(each, "as written").axes[0].images[0].get_array() for each in (rows, part))
+    assert not np.ma.is_masked(before[5, 4]) and np.isnan(np.ma.filled(after, np.nan)[5, 4])
