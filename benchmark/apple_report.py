@@ -21,7 +21,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 import tyro
 from apple_players import QUICK, load_method, shortest_path
-from common import ROOT, commit, commit_of, published_table, write_csv
+from common import ROOT, commit, commit_of, finished_runs, published_table, write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -49,11 +49,8 @@ class Args:
 def read_runs(folder: Path) -> list[dict]:
     """One row for every finished run: what it was and what it scored."""
     rows = []
-    for path in sorted(folder.glob("*/result.json")):
-        result, args = json.loads(path.read_text()), json.loads((path.parent / "args.json").read_text())
-        kind = re.sub(r"_seed\d+$", "", path.parent.name)
-        if not result["complete"]:
-            continue
+    for run, result in finished_runs(folder):
+        args, kind = json.loads((run / "args.json").read_text()), re.sub(r"_seed\d+$", "", run.name)
         is_student = "sampled" in result["evaluation"]
         evaluations = result["evaluation"] if is_student else {"greedy": result["evaluation"]}
         for mode, numbers in evaluations.items():

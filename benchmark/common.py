@@ -2,7 +2,9 @@
 
 import csv
 import hashlib
+import json
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -17,6 +19,14 @@ def published_rows(name: str) -> list[dict[str, str]]:
 def published_table(name: str) -> dict[str, dict[str, str]]:
     """The rows of a published table by agent."""
     return {row["agent"]: row for row in published_rows(name)}
+
+
+def finished_runs(folder: Path) -> Iterator[tuple[Path, dict]]:
+    """The folder and the result of each run that came to the end of its schedule, in the order of their names."""
+    for path in sorted(folder.glob("*/result.json")):
+        result = json.loads(path.read_text())
+        if result["complete"]:
+            yield path.parent, result
 
 
 def write_csv(path: Path, rows: list[dict]) -> None:

@@ -6,12 +6,11 @@ done
 python benchmark/fourrooms_players.py        # runs/fourrooms -> benchmark/results/fourrooms
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from common import ROOT, commit, commit_of, write_csv
+from common import ROOT, commit, commit_of, finished_runs, write_csv
 
 
 @dataclass
@@ -25,14 +24,12 @@ class Args:
 def read_runs(folder: Path) -> list[dict]:
     """One row for each run that came to the end of its steps."""
     rows = []
-    for path in sorted(folder.glob("*/result.json")):
-        result = json.loads(path.read_text())
-        if result["complete"]:
-            greedy = result["evaluation"]
-            row = {"env_id": result["env_id"], "seed": result["seed"], "steps": result["global_step"]}
-            row |= {"minutes": round(result["training_seconds"] / 60, 1), "sampled": result["training"]["mean"]}
-            row |= {"greedy": greedy["mean"], "optimal": greedy["optimal"], "solved": greedy["solved"]}
-            rows.append({**row, "commit": commit_of("ppo_fourrooms", result["script_sha256"])})
+    for _, result in finished_runs(folder):
+        greedy = result["evaluation"]
+        row = {"env_id": result["env_id"], "seed": result["seed"], "steps": result["global_step"]}
+        row |= {"minutes": round(result["training_seconds"] / 60, 1), "sampled": result["training"]["mean"]}
+        row |= {"greedy": greedy["mean"], "optimal": greedy["optimal"], "solved": greedy["solved"]}
+        rows.append({**row, "commit": commit_of("ppo_fourrooms", result["script_sha256"])})
     return rows
 
 

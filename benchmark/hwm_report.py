@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from common import ROOT, commit, commit_of, write_csv
+from common import ROOT, commit, commit_of, finished_runs, write_csv
 from scipy import stats
 
 RUNGS = {
@@ -51,17 +51,14 @@ class Args:
 def read_runs(folder: Path) -> list[dict]:
     """One row for each finished run: rung, seed, how m was found, and its measures."""
     rows = []
-    for path in sorted(folder.glob("*/result.json")):
-        result, name = json.loads(path.read_text()), path.parent.name
-        if not result["complete"]:
-            continue
-        segmentation = json.loads((path.parent / "segmentation.json").read_text())
+    for run, result in finished_runs(folder):
+        segmentation = json.loads((run / "segmentation.json").read_text())
         best = {
             key: max(floor[key] for name, floor in segmentation["floors"].items() if re.fullmatch(IGNORANT, name))
             for key in MEASURES
             if key.startswith("f1")
         }
-        about = {"rung": re.sub(r"_seed\d+$", "", name), "seed": result["seed"], "run": name}
+        about = {"rung": re.sub(r"_seed\d+$", "", run.name), "seed": result["seed"], "run": run.name}
         about |= {"script_sha256": result["script_sha256"], "training_seconds": result["training_seconds"]}
         for mode in ("prior", "sampled", "posterior"):
             made = segmentation[mode]

@@ -6,13 +6,12 @@ Takes whatever part of the runs is done, and says which.
 """
 
 import csv
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
-from common import write_csv
+from common import finished_runs, write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -35,10 +34,8 @@ def read_csv(path: Path) -> list[dict[str, str]]:
 def read_runs(folder: Path) -> list[dict]:
     """One row for every run that came to the end of its schedule: what Table 4.4 and its steadier form need, and what it cost."""
     rows = []
-    for path in sorted(folder.glob("*/result.json")):
-        result, episodes = json.loads(path.read_text()), read_csv(path.parent / "episodes.csv")
-        if not result["complete"]:
-            continue
+    for run, result in finished_runs(folder):
+        episodes = read_csv(run / "episodes.csv")
         returns = [float(row["episodic_return"]) for row in episodes]
         rows.append(
             {
@@ -50,7 +47,7 @@ def read_runs(folder: Path) -> list[dict]:
                 "last_50": round(float(np.mean(returns[-50:])), 2),
                 "greedy_evaluation": round(result["evaluation"]["mean"], 2),
                 "training_seconds": round(result["training_seconds"]),
-                "folder": path.parent.name,
+                "folder": run.name,
             }
         )
     return rows

@@ -14,7 +14,6 @@ the peer, round by round, with their range. The ratios are the result: the machi
 import json
 import os
 import platform
-import resource
 import statistics
 import subprocess
 import sys
@@ -223,40 +222,13 @@ def time_gail(args: Args) -> None:
 
 
 def rooms_contenders(work: Work) -> dict:
-    """Frames of the whole maze at each step: MiniGrid's own (19 × 19), and ours one by one and side by side."""
-    import gymnasium as gym
-    import minigrid.wrappers
-
-    name = f"cleanrl_thesis.ppo_fourrooms:{work.env_id}"
-
-    def minigrids() -> gym.Env:
-        return minigrid.wrappers.RGBImgObsWrapper(gym.make("MiniGrid-FourRooms-v0", highlight=False))
-
-    def single(env: gym.Env, steps: int) -> dict[str, float]:
-        env.action_space.seed(1)
-        env.reset(seed=1)
-        start = time.perf_counter()
-        for _ in range(steps):
-            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-            if terminated or truncated:
-                env.reset()
-        return {"steps_per_second": steps / (time.perf_counter() - start), "peak_memory_mb": peak_memory()}
-
-    def many(games: int) -> dict[str, float]:
-        speed = time_environment(name, games, work.steps // games, 1)[0]
-        return {"steps_per_second": speed, "peak_memory_mb": peak_memory()}
-
+    """Frames of the whole maze at each step: MiniGrid's own (19 × 19 cells), and ours one by one and side by side."""
     return {
-        "MiniGrid, RGBImgObsWrapper": lambda: single(minigrids(), 1_000),
-        "one game": lambda: single(gym.make(name, disable_env_checker=True), 5_000),
-        "64 games": lambda: many(64),
-        "256 games": lambda: many(256),
+        "MiniGrid, RGBImgObsWrapper": lambda: time_peer("fourrooms_steps.py", "MiniGrid-FourRooms-v0", 1, 1_000),
+        "one game": lambda: time_peer("fourrooms_steps.py", work.env_id, 1, 5_000),
+        "64 games": lambda: time_peer("fourrooms_steps.py", work.env_id, 64, work.steps // 64),
+        "256 games": lambda: time_peer("fourrooms_steps.py", work.env_id, 256, work.steps // 256),
     }
-
-
-def peak_memory() -> float:
-    """Of this process so far, in MB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def time_rooms(args: Args) -> None:
@@ -268,6 +240,5 @@ if __name__ == "__main__":
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # before numpy is imported
     arguments = tyro.cli(Args)
-    {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail, "rooms": time_rooms}[arguments.what](
-        arguments
-    )
+    times = {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail, "rooms": time_rooms}
+    times[arguments.what](arguments)
