@@ -9,14 +9,14 @@ SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/pytho
 RUNGS=${RUNGS:-narrow faithful reset kl_w price no_budget} PLAYER=${PLAYER:-runs/fourrooms/11_seed1}
 mkdir -p "$RUNS"
 "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --save-demos 2600 --save-model --run-dir "$PLAYER" --resume
-# what --faithful sets, for the rungs that change one thing of it
+# rung (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of it
 FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
 FAITHFUL+=" --stoch-w 16 --kl-m-scale 1"
 for rung in $RUNGS; do
   case $rung in
     narrow) flags="" ;;                                # (e) the default
     no_budget) flags="--budget-price 0" ;;             # (e) without the budget
-    faithful) flags="--faithful" ;;                    # (a)
+    faithful) flags="$FAITHFUL" ;;
     kl_w) flags="$FAITHFUL --kl-w-scale 1" ;;          # (b) a larger weight of KL_w
     reset) flags="$FAITHFUL --w-reset" ;;              # (c) w starts anew where z is read
     price) flags="$FAITHFUL --read-price 10" ;;        # (d) a price for each read

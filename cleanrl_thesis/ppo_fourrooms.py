@@ -2,11 +2,10 @@
 
     python cleanrl_thesis/ppo_fourrooms.py --save-demos 2600 --run-dir runs/fourrooms11     # 25,000 pairs and held-out ones
     python cleanrl_thesis/ppo_fourrooms.py --env-id FourRooms19-v0 --save-model
-    python cleanrl_thesis/ppo_fourrooms.py --compile                                        # faster
 
 The task is built in (`gymnasium.make("cleanrl_thesis.ppo_fourrooms:FourRooms11-v0")`): MiniGrid's FourRooms with fixed doors,
-three actions, and frames of the whole maze, 64 × 64 × 3. `gymnasium.make_vec` gives the same game by tables, hundreds of
-times faster; training uses that. `--run-dir DIR --resume` can be sent again after every crash: on the same machine the
+three actions, and frames of the whole maze, 64 × 64 × 3. `gymnasium.make_vec` gives the same game by tables, a hundred times
+faster; training uses that. `--run-dir DIR --resume` can be sent again after every crash: on the same machine the
 run ends with the same bytes.
 
 | setting | here | source |
@@ -288,7 +287,7 @@ class Painter:
     """Draws states as frames (side, side, 3): MiniGrid's picture of the whole maze, without highlight, shrunk.
 
     Shrinking is linear, so a frame is one of the C frames of a goal, with what the agent changes in the window around
-    its cell added to it. That is 300 times faster than to draw each frame anew.
+    its cell added to it.
     """
 
     def __init__(self, maze: Maze, side: int):
@@ -1033,7 +1032,7 @@ def write_demonstrations(folder: Path, episodes: Iterable[dict[str, np.ndarray]]
 
     Each file has observations (T + 1, ...), actions (T, ...), rewards (T,), terminated, truncated, seed, and t_ns (T,),
     the time of each action in nanoseconds, simulated where the environment says how many frames a second has; here also
-    states (T + 1, 3) and rooms (T + 1,), and the files are compressed, to a fiftieth.
+    states (T + 1, 3) and rooms (T + 1,), and the files are compressed.
     """
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))

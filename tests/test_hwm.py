@@ -20,6 +20,10 @@ sys.path.append(str(ROOT / "benchmark"))
 import hwm_report  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "hwm_segment.py"
+FAITHFUL = {  # rung (a) of benchmark/hwm_segment.sh
+    **{"w_reset": False, "narrow_w": False, "decoder_sees_h": True, "detach_kl_z": False, "budget_price": 0.0},
+    **{"boundary_bound": 0.0, "read_bias": 0.0, "kl_m_scale": 1.0},
+}
 SIZES = {"deter_z": 5, "stoch_z": 3, "deter_w": 6, "stoch_w": 2, "hidden_size": 16}
 SMALL = [
     *("--train-pairs", 300, "--total-updates", 12, "--checkpoint-interval", 2, "--batch-size", 4, "--chunk-length", 8),
@@ -115,7 +119,7 @@ def test_boundaries_drawn_by_gumbel_noise_have_the_probability_of_their_logit():
     assert (gradient >= 0).all() and (gradient > 0).float().mean() > 0.5  # of the soft sample
 
 
-@pytest.mark.parametrize("flags", [{}, {"faithful": True}], ids=["default", "faithful"])
+@pytest.mark.parametrize("flags", [{}, FAITHFUL], ids=["default", "faithful"])
 def test_copy_and_update_follow_a_boundary_given_by_hand(flags):
     """m_t = 1 at t = 1 and 4, an episode begins at 6: z is read at 0, 2, 5 and 6, and copied elsewhere."""
     model, data = make_model(**flags), make_data([[6, 3]])
@@ -169,7 +173,7 @@ def test_posterior_and_prior_boundaries_are_paired_at_the_same_step():
 
 def test_loss_is_the_sum_of_its_terms():
     """Eq. 3.3.5, term by term, with torch.distributions: KL_z where z is read, KL_w at each step."""
-    model, data = make_model(faithful=True, image_scale=2.0), make_data([[5, 4], [9]])
+    model, data = make_model(**FAITHFUL, image_scale=2.0), make_data([[5, 4], [9]])
     torch.manual_seed(3)
     made = model.infer(data, "train", 0.7)
     torch.manual_seed(3)
@@ -199,10 +203,10 @@ def test_prices_of_reads():
     assert priced.item() - plain.item() == pytest.approx(10 * (rate - 0.25) + 3 * rate, rel=1e-3)
 
 
-@pytest.mark.parametrize("faithful", [False, True])
-def test_nothing_leaks_over_the_border_of_an_episode(faithful):
+@pytest.mark.parametrize("flags", [{}, FAITHFUL], ids=["default", "faithful"])
+def test_nothing_leaks_over_the_border_of_an_episode(flags):
     """Other frames and actions in the second episode of a column change nothing in the first, nor in other columns."""
-    model, data = make_model(faithful=faithful), make_data([[6, 5], [11]])
+    model, data = make_model(**flags), make_data([[6, 5], [11]])
     frames, actions = data.frames.clone(), data.actions.clone()
     frames[6:, 0], actions[6:, 0] = torch.randn(5, 7), (actions[6:, 0] + 1) % 3
     for mode in ("posterior", "prior"):
