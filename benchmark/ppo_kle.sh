@@ -3,6 +3,8 @@
 # 1,210 runs. Can be sent again after every stop; stages share their runs.
 #   benchmark/ppo_kle.sh                                                         all 1,210, 2,000,000 steps each
 #   STAGES="first targets seeds others" STOP_AT=500000 benchmark/ppo_kle.sh      459 of them and more seeds, 500,000 steps
+#   STAGES="K10 K80" benchmark/ppo_kle.sh                                        72 of these to 2,000,000 steps
+#   STAGES=cost STOP_AT=100000 WORKERS=1 RUNS=runs/ppo_kle_cost benchmark/ppo_kle.sh  22 short runs that time each task
 #   WORKERS=200 SLURM=benchmark/slurm_template.sh benchmark/ppo_kle.sh           on a cluster, 200 runs at a time
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -15,8 +17,8 @@ sweep() {  # name of the stage, then what differs
 }
 both() { for target in "$@"; do echo "kle-stop,d-target=$target" "kle-rollback,d-target=$target"; done; }
 for stage in $STAGES; do
-  case $stage in first | targets | seeds | others | all) ;; *)
-    echo "STAGES=$STAGES: must be of first, targets, seeds, others and all" >&2
+  case $stage in first | targets | seeds | others | K10 | K80 | all | cost) ;; *)
+    echo "STAGES=$STAGES: must be of first, targets, seeds, others, K10, K80, all and cost" >&2
     exit 2
     ;;
   esac
@@ -28,6 +30,8 @@ for stage in $STAGES; do
     targets) sweep targets --env-ids "${SIX[@]}" --num-seeds 2 --grid update-epochs=10,80 --variants $(both 0.015 0.05) ;;
     seeds) sweep seeds --env-ids "${SIX[@]}" --start-seed 3 --num-seeds 3 --grid update-epochs=10,80 --variants none $(both 0.03) ;;
     others) sweep others --env-ids "${FIVE[@]}" --num-seeds 1 --grid update-epochs=4,10,20,40,80 --variants none $(both 0.03) ;;
+    K10 | K80) sweep "$stage" --env-ids "${SIX[@]}" --num-seeds 2 --grid "update-epochs=${stage#K}" --variants none $(both 0.03) ;;
+    cost) sweep cost --env-ids "${SIX[@]}" "${FIVE[@]}" --num-seeds 1 --grid update-epochs=10,80 ;;
     all) sweep all --env-ids "${SIX[@]}" "${FIVE[@]}" --num-seeds 2 --grid update-epochs=4,10,20,40,80 \
       --variants none $(both 0.015 0.02 0.025 0.03 0.05) ;;
   esac || code=$?

@@ -43,6 +43,7 @@ SCORES = {
 }
 RESAMPLES = 2_000
 SETTING = ("task", "method", "d_target", "K", "seed")  # what a run differs in
+COST = ("task", "K", "seed", "all_iterations", "seconds_per_step")
 FREE = {"env_id", "seed", "update_epochs", "kle_stop", "kle_rollback", "d_target"}  # and by which arguments
 FREE |= {"run_dir", "resume", "stop_at", "checkpoint_interval", "compile", "cuda", "num_threads", "exp_name"}
 FREE |= {"track", "wandb_project_name", "wandb_entity", "capture_video", "save_model", "save_demos", "eval_episodes"}
@@ -65,6 +66,8 @@ class Args:
     """the part of each run that is reported"""
     out: Path | None = None
     """folder for tables and figures; default: benchmark/results/ppo_kle/{steps}"""
+    cost: Path | None = None
+    """folder of runs that were timed with nothing beside them (stage `cost`), for the cost; default: `--runs`"""
     workers: int = os.cpu_count() or 1
     """processes that read"""
 
@@ -735,10 +738,10 @@ def provenance(rows: list[dict], args: Args) -> str:
     )
 
 
-def tables(rows: list[dict], all_rows: list[dict], steps: int) -> dict[str, list[list[str]]]:
+def tables(rows: list[dict], timed: list[dict], steps: int) -> dict[str, list[list[str]]]:
     """All tables by their captions; published numbers, which are of 2,000,000 steps, only beside runs of as many.
 
-    Speeds are those of `all_rows`, of runs that have not come so far too.
+    The cost is that of the rows `timed`, whose runs need not have come so far.
     """
     is_whole = steps == 2_000_000
     ner, iterations, returns = None, None, None
@@ -756,7 +759,7 @@ def tables(rows: list[dict], all_rows: list[dict], steps: int) -> dict[str, list
     for definition in SCORES:
         made[f"Findings, NER {definition}{of}"] = findings_table(rows, definition, is_whole)
     made[f"Interquartile mean of the NER as written{of}, with its 95% interval"] = iqm_table(rows, "as written")
-    made["Cost of the study on one core"] = cost_table(all_rows)
+    made["Cost of the study on one core"] = cost_table(timed)
     return made
 
 
@@ -771,7 +774,10 @@ def main(args: Args) -> None:
     write_csv(out / "runs.csv", [{key: row.get(key, "") for key in rows[0] | {"seconds_per_step": ""}} for row in rows])
     for definition in SCORES:
         normalise(rows, definition)
-    made = tables(rows, [run["row"] for run in found], args.steps)
+    timed = [run["row"] for run in (read_runs(args.cost, args.steps, args.workers) if args.cost else found)]
+    if args.cost:
+        write_csv(out / "cost.csv", [{key: row[key] for key in COST} for row in timed if "seconds_per_step" in row])
+    made = tables(rows, timed, args.steps)
     text = provenance(rows, args) + "\n".join(f"## {name}\n\n{markdown(lines)}" for name, lines in made.items())
     (out / "tables.md").write_text(text)
     (out / "tables.tex").write_text("\n".join(latex(lines, name) for name, lines in made.items()))

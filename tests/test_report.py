@@ -262,6 +262,19 @@ def test_cost_is_that_of_the_study_s_iterations():
     assert lines["sum of 1 of 11 tasks"][-1] == lines["Ant-v2"][-1] and "Hopper-v2" not in lines
 
 
+def test_cost_by_runs_that_were_timed_alone(study, tmp_path):
+    """`--cost` takes the speeds from another folder, and keeps them beside the tables."""
+    timed = tmp_path / "timed"
+    for k in (10, 80):
+        speed = {"steps_per_second": 1e5 / k}
+        write_run(timed, "Hopper-v2", "PPO", k, None, 1, np.zeros(20), np.full(10, k), **speed)
+    report.main(report.Args(runs=study, steps=102_400, out=tmp_path / "out", cost=timed, workers=1))
+    table = (tmp_path / "out" / "tables.md").read_text().split("Cost of the study")[1]
+    assert "| Hopper-v2 | 2 |" in table and "sum of 1 of 11 tasks" in table
+    with open(tmp_path / "out" / "cost.csv") as file:
+        assert [float(row["seconds_per_step"]) for row in csv.DictReader(file)] == pytest.approx([1e-4, 8e-4])
+
+
 def test_a_setting_without_all_tasks_is_compared_with_none(rows):
     """KLE-Stop 0.05 at K = 80 on one task of two: not in the interquartile means; of one seed there is no interval."""
     part = [row for row in rows if (row["K"], row["d_target"], row["task"]) != (80, 0.05, "Hopper-v2")]
