@@ -11,7 +11,7 @@ mkdir -p "$RUNS"
 "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --save-demos 2600 --save-model --run-dir "$PLAYER" --resume
 # rung (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of it
 FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
-FAITHFUL+=" --stoch-w 16 --kl-m-scale 1"
+FAITHFUL+=" --stoch-w 16 --kl-m-scale 1 --max-segments 10"
 for rung in $RUNGS; do
   case $rung in
     narrow) flags="" ;;                                # (e) the default

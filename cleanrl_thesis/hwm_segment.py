@@ -20,7 +20,8 @@ be sent again after every crash: on the same machine the run ends with the same 
 
 The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 without the last three lines:
 `--no-w-reset --no-narrow-w --decoder-sees-h --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0 --stoch-w 16
---kl-m-scale 1`; the others are in `benchmark/hwm_segment.sh`. Frames are shrunk and centred, and the agent's red counts more.
+--kl-m-scale 1 --max-segments 10`; the others are in `benchmark/hwm_segment.sh`. Frames are shrunk and centred, and the
+agent's red counts more.
 """
 
 # /// script
@@ -155,6 +156,8 @@ class Args:
     """logit of q(m) at first: start with many reads"""
     max_segment_length: int = 20
     """in training, a read is forced after as many steps without; 0 for never (VTA)"""
+    max_segments: int = 0
+    """in training, a copy is forced after as many segments of an episode; 0 for never (VTA: 10)"""
     w_reset: bool = True
     """w starts anew from z where z is read (VTA; the thesis: no)"""
     narrow_w: bool = True
@@ -225,7 +228,7 @@ def complete_args(args: Args) -> Args:
         ("read_bias std_bias", math.isfinite, "must be finite"),
         ("kl_balance budget", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("temperature", lambda x: 0 < x <= 1, "must be greater than 0 and at most 1"),
-        ("max_segment_length", lambda x: x >= 0, "must be at least 0"),
+        ("max_segment_length max_segments", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
     ):
         for name in names.split():
@@ -463,7 +466,7 @@ class Inference(NamedTuple):
 
     belief: Belief  # (T, B, ...)
     reads: torch.Tensor  # (T, B): 1 where z was read, 0 where it was copied
-    forced: torch.Tensor  # (T, B): 1 where the read was not the model's choice
+    forced: torch.Tensor  # (T, B): 1 where the read or copy was not the model's choice
     q_z: Normal  # (T, B, stoch_z)
     q_w: Normal  # (T, B, stoch_w)
     q_m: torch.Tensor  # (T, B): logits
@@ -544,7 +547,8 @@ class HWM(nn.Module):
         taken = F.one_hot(actions, self.num_actions).float()  # (T, B, A)
         sizes = (self.args.stoch_z, self.args.stoch_w)
         noise = [torch.randn(steps, batch, size, device=frames.device) * trains for size in sizes]
-        state, length = self.start(batch, frames), frames.new_zeros(batch, 1)
+        state = self.start(batch, frames)
+        length, segments = frames.new_zeros(batch, 1), frames.new_zeros(batch, 1)
         previous_m, previous_action = frames.new_zeros(batch, 1), torch.zeros_like(taken[0])
         made = []
         for t in range(steps):
@@ -555,7 +559,11 @@ class HWM(nn.Module):
             if trains and self.args.max_segment_length:
                 too_long = (length >= self.args.max_segment_length).float()
                 read, force = torch.maximum(read, too_long), torch.maximum(force, too_long)
+            if trains and self.args.max_segments:
+                too_many = (1 - begins) * (segments >= self.args.max_segments).float()
+                read, force = (1 - too_many) * read, torch.maximum(force, too_many)
             length = (1 - read.detach()) * length + 1
+            segments = (1 - begins) * segments + read.detach()
             state = Belief(*((1 - begins) * part for part in state))
             previous_action = (1 - begins) * previous_action
             draws = noise[0][t], noise[1][t]

@@ -240,6 +240,16 @@ def test_long_segments_are_cut_in_training_only():
     assert model.infer(data, "posterior").reads[:, 0].tolist() == [1] + [0] * 11
 
 
+def test_segments_are_no_more_than_asked_in_training_only():
+    """Each episode of a chunk may read three times; a forced copy is not the model's choice."""
+    model, data = make_model(max_segments=3), make_data([[6, 5]])
+    model.posterior_m.forward = lambda embed, first: torch.full((11, 1), 50.0)
+    made = model.infer(data, "train")
+    assert made.reads[:, 0].tolist() == [1, 1, 1, 0, 0, 0, 1, 1, 1, 0, 0]
+    assert made.forced[:, 0].tolist() == [1, 0, 0, 1, 1, 1, 1, 0, 0, 1, 1]
+    assert model.infer(data, "posterior").reads[:, 0].tolist() == [1] * 11
+
+
 def test_z_of_the_prior_needs_no_frame_after_the_first():
     """Section 3.5.1: only w sees the frames; with actions and boundaries as before, c at the second read is what w made it."""
     model, data = make_model(), make_data([[8]])

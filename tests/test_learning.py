@@ -9,6 +9,7 @@ pytestmark = pytest.mark.slow
 
 
 DDPG, GAIL = ROOT / "cleanrl_thesis" / "ddpg_torcs_like.py", ROOT / "cleanrl_thesis" / "gail_hybrid.py"
+ROOMS = ROOT / "cleanrl_thesis" / "ppo_fourrooms.py"
 
 
 def evaluation(folder, *flags, script=SCRIPT) -> float:
@@ -56,3 +57,9 @@ def test_gail_drives_like_the_synthetic_human(tmp_path):
         part["driving"]["score"]["mean"] for part in (result["experts"]["human"], result["evaluation"]["sampled"])
     )
     assert student > 0.65 * human
+
+
+def test_ppo_finds_its_way_through_four_rooms(tmp_path):
+    """Return of the last 500 episodes of training; random play gets 0.024, the shortest ways 0.900."""
+    run("--stop-at", 500_000, "--eval-episodes", 20, "--run-dir", "run", cwd=tmp_path, script=ROOMS)
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["training"]["mean"] > 0.4
