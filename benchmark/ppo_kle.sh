@@ -2,7 +2,7 @@
 # The study of chapter 4: 11 tasks × K {4, 10, 20, 40, 80} × {plain, KLE-Stop and KLE-Rollback at five d_target} × 2 seeds,
 # 1,210 runs. Can be sent again after every stop; stages share their runs.
 #   benchmark/ppo_kle.sh                                                         all 1,210, 2,000,000 steps each
-#   STAGES="first targets seeds others" STOP_AT=500000 benchmark/ppo_kle.sh      459 of them and more seeds, 500,000 steps
+#   STAGES="first targets seeds others" STOP_AT=500000 benchmark/ppo_kle.sh      351 of them, 108 with more seeds, 500,000 steps
 #   STAGES="K10 K80" benchmark/ppo_kle.sh                                        72 of these to 2,000,000 steps
 #   STAGES=cost STOP_AT=100000 WORKERS=1 RUNS=runs/ppo_kle_cost benchmark/ppo_kle.sh  22 short runs that time each task
 #   WORKERS=200 SLURM=benchmark/slurm_template.sh benchmark/ppo_kle.sh           on a cluster, 200 runs at a time

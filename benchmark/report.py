@@ -732,10 +732,14 @@ def provenance(rows: list[dict], args: Args) -> str:
     digests = {row["script_sha256"] for row in rows} - {""}
     made_at = sorted({commit_of("ppo_continuous_kle", digest) for digest in digests})
     cost = f" --cost runs/{args.cost.name}" if args.cost else ""
+    timed = (
+        "; the cost is from `STAGES=cost STOP_AT=100000 WORKERS=1` of the same script (`cost.csv`)" if args.cost else ""
+    )
     hours = sum(row["steps"] * row["seconds_per_step"] for row in rows if "seconds_per_step" in row) / 3600
     return (
         f"`benchmark/ppo_kle.sh`, ppo_continuous_kle.py at {', '.join(made_at)}; `python benchmark/report.py --steps "
-        f"{args.steps}{cost}` at {commit()}. {hours:.1f} core-hours of training, one thread each.\n\n{coverage(rows, args.steps)}\n\n"
+        f"{args.steps}{cost}` at {commit()}. {hours:.1f} core-hours of training, one thread each{timed}.\n\n"
+        f"{coverage(rows, args.steps)}\n\n"
     )
 
 
