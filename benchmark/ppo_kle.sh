@@ -4,11 +4,13 @@
 #   benchmark/ppo_kle.sh                                                         all 1,210, 2,000,000 steps each
 #   STAGES="first targets seeds others" STOP_AT=500000 benchmark/ppo_kle.sh      351 of them, 108 with more seeds, 500,000 steps
 #   STAGES="K10 K80" benchmark/ppo_kle.sh                                        72 of these to 2,000,000 steps
+#   STAGES="K10 K80" START_SEED=5 NUM_SEEDS=1 benchmark/ppo_kle.sh               the same of seed 5, 36 runs
 #   STAGES=cost STOP_AT=100000 WORKERS=1 RUNS=runs/ppo_kle_cost benchmark/ppo_kle.sh  22 short runs that time each task
 #   WORKERS=200 SLURM=benchmark/slurm_template.sh benchmark/ppo_kle.sh           on a cluster, 200 runs at a time
 set -euo pipefail
 cd "$(dirname "$0")/.."
 STAGES=${STAGES:-all} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/ppo_kle}
+START_SEED=${START_SEED:-1} NUM_SEEDS=${NUM_SEEDS:-2}  # of K10 and K80
 SIX=(kle/{HalfCheetah,Hopper,Walker2d,Swimmer,Reacher,InvertedPendulum}-v2)
 FIVE=(kle/{Ant,Humanoid,Pusher,Striker,Thrower}-v2)
 sweep() {  # name of the stage, then what differs
@@ -30,7 +32,8 @@ for stage in $STAGES; do
     targets) sweep targets --env-ids "${SIX[@]}" --num-seeds 2 --grid update-epochs=10,80 --variants $(both 0.015 0.05) ;;
     seeds) sweep seeds --env-ids "${SIX[@]}" --start-seed 3 --num-seeds 3 --grid update-epochs=10,80 --variants none $(both 0.03) ;;
     others) sweep others --env-ids "${FIVE[@]}" --num-seeds 1 --grid update-epochs=4,10,20,40,80 --variants none $(both 0.03) ;;
-    K10 | K80) sweep "$stage" --env-ids "${SIX[@]}" --num-seeds 2 --grid "update-epochs=${stage#K}" --variants none $(both 0.03) ;;
+    K10 | K80) sweep "$stage-seeds$START_SEED-$((START_SEED + NUM_SEEDS - 1))" --env-ids "${SIX[@]}" --start-seed "$START_SEED" \
+      --num-seeds "$NUM_SEEDS" --grid "update-epochs=${stage#K}" --variants none $(both 0.03) ;;
     cost) sweep cost --env-ids "${SIX[@]}" "${FIVE[@]}" --num-seeds 1 --grid update-epochs=10,80 ;;
     all) sweep all --env-ids "${SIX[@]}" "${FIVE[@]}" --num-seeds 2 --grid update-epochs=4,10,20,40,80 \
       --variants none $(both 0.015 0.02 0.025 0.03 0.05) ;;
