@@ -2,6 +2,7 @@
 
     python benchmark/report.py                                # runs/ppo_kle -> benchmark/results/ppo_kle
     python benchmark/report.py --steps 500000                 # the first 500,000 steps of every run that has them
+    python benchmark/report.py --known DIR                    # with the runs of an earlier report whose folders are gone
 
 Takes whatever part of the 1,210 runs of `benchmark/ppo_kle.sh` has come to `--steps`, and says which. The normalised
 episode reward (NER) of a run is where its score lies between the least and the greatest of its task, in two definitions:
@@ -14,6 +15,7 @@ they should have, half with 2 seeds, so the deviations from a task's mean are st
 where the interval is above 0, contradicted where it is below, and open else, or where a task has a single seed.
 """
 
+import csv
 import json
 import os
 import re
@@ -37,6 +39,7 @@ TARGETS = (0.015, 0.02, 0.025, 0.03, 0.05)
 TASKS = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "InvertedPendulum", "Pusher", "Reacher", "Striker", "Swimmer")
 TASKS = tuple(f"{task}-v2" for task in (*TASKS, "Thrower", "Walker2d"))
 BINS = 100  # of a run, for its curves
+CURVES = ("return", "kl", "iterations")
 SCORES = {
     "as tabulated": ("last_episode", "last_episode", "last_episode"),
     "as written": ("last_50", "least", "greatest"),
@@ -68,6 +71,8 @@ class Args:
     """folder for tables and figures; default: benchmark/results/ppo_kle/{steps}"""
     cost: Path | None = None
     """folder of runs that were timed with nothing beside them (stage `cost`), for the cost; default: `--runs`"""
+    known: Path | None = None
+    """folder of an earlier report of as many steps: its runs count as well, unless they are in `--runs`, and its cost"""
     workers: int = os.cpu_count() or 1
     """processes that read"""
 
@@ -139,11 +144,11 @@ def read_run(steps: int, folder: Path) -> dict:
         "script_sha256": "" if result is None else result["script_sha256"][:12],
     }
     curves = binned(at, returns, steps), binned(update, kl, steps), binned(update, iterations, steps)
-    return {"row": row, "args": same, "curves": dict(zip(("return", "kl", "iterations"), curves))}
+    return {"row": row, "args": same, "curves": dict(zip(CURVES, curves))}
 
 
 def read_runs(folder: Path, steps: int, workers: int) -> list[dict]:
-    """All runs in the order of their settings; those that have not come to `steps` have no curves.
+    """All runs of a folder; those that have not come to `steps` have no curves.
 
     Raises SystemExit where runs are not of one study.
     """
@@ -158,6 +163,35 @@ def read_runs(folder: Path, steps: int, workers: int) -> list[dict]:
     twice = next((path for path, setting in zip(folders, settings) if settings.count(setting) > 1), None)
     if twice is not None:
         raise SystemExit(f"{twice}: is there twice, under another name")
+    return runs
+
+
+def read_known(folder: Path) -> list[dict]:
+    """The runs of an earlier report as `read_runs` gives them; without curves where the report has kept none."""
+    curves = dict(np.load(folder / "curves.npz")) if (folder / "curves.npz").exists() else {}
+    with open(folder / "runs.csv", newline="") as file:
+        rows = [{key: number(key, value) for key, value in row.items()} for row in csv.DictReader(file)]
+    runs = [{"row": {key: value for key, value in row.items() if value != "" or key == "d_target"}} for row in rows]
+    for run in runs:
+        run["curves"] = dict(zip(CURVES, curves[key])) if (key := run_name(run["row"])) in curves else {}
+    return runs
+
+
+def number(column: str, text: str) -> int | float | str:
+    """What a cell of `runs.csv` or `cost.csv` holds."""
+    if column in ("task", "method", "script_sha256") or not text:
+        return text
+    return int(text) if text.isdigit() else float(text)
+
+
+def run_name(row: dict) -> str:
+    return "_".join(str(row[key]) for key in SETTING)
+
+
+def in_order(runs: list[dict], known: list[dict]) -> list[dict]:
+    """Runs, and those known runs that are not among them, in the order of their settings."""
+    names = {run_name(run["row"]) for run in runs}
+    runs = runs + [run for run in known if run_name(run["row"]) not in names]
     return sorted(runs, key=lambda run: [str(run["row"][key]) for key in SETTING])
 
 
@@ -570,6 +604,11 @@ def score_over_k(axes, rows: list[dict], column: str) -> None:
     legend(axes, "small")
 
 
+def with_curves(runs: list[dict], task: str, *setting) -> list[dict]:
+    """The runs of a task and a setting whose curves are known."""
+    return [run for run in runs if run["curves"] and run["row"]["task"] == task and select([run["row"]], *setting)]
+
+
 def curve(axes, runs: list[dict], name: str, steps: int, **style) -> None:
     """Mean and range of the seeds' curves."""
     at = (np.arange(BINS) + 0.5) * steps / BINS / 1e6
@@ -588,8 +627,7 @@ def figure_4_1(runs: list[dict], column: str, steps: int) -> Figure:
     for panel, (name, title) in zip(axes[0, 1:], panels.items()):
         for method, target in (("PPO", None), ("stop", 0.03), ("rollback", 0.03)):
             for k, line in ((10, "-"), (80, "--")):
-                found = [run for run in runs if run["row"] in select([run["row"]], method, k, target)]
-                found = [run for run in found if run["row"]["task"] == "HalfCheetah-v2"]
+                found = with_curves(runs, "HalfCheetah-v2", method, k, target)
                 if found:
                     label = f"{METHODS[method]}{'' if target is None else f' {target}'}, K = {k}"
                     curve(panel, found, name, steps, color=COLOURS[method], linestyle=line, label=label)
@@ -670,7 +708,7 @@ def curves_figure(runs: list[dict], steps: int) -> Figure:
     for panel, task in zip(axes.flat, tasks):
         for method, target in (("PPO", None), ("stop", 0.03), ("rollback", 0.03)):
             for k, line in ((10, "-"), (80, "--")):
-                found = [run for run in runs if select([run["row"]], method, k, target) and run["row"]["task"] == task]
+                found = with_curves(runs, task, method, k, target)
                 if found:
                     label = f"{METHODS[method]}{'' if target is None else f' {target}'}, K = {k}"
                     curve(panel, found, "return", steps, color=COLOURS[method], linestyle=line, label=label)
@@ -727,19 +765,19 @@ def profiles(rows: list[dict], column: str) -> Figure:
 # ---------------------------------------------------------------------------------------------------------------------
 # The report
 # ---------------------------------------------------------------------------------------------------------------------
-def provenance(rows: list[dict], args: Args) -> str:
-    """What the results rest on."""
+def provenance(rows: list[dict], args: Args, old: int) -> str:
+    """What the results rest on; `old` runs are of an earlier report."""
     digests = {row["script_sha256"] for row in rows} - {""}
     made_at = sorted({commit_of("ppo_continuous_kle", digest) for digest in digests})
-    cost = f" --cost runs/{args.cost.name}" if args.cost else ""
-    timed = (
-        "; the cost is from `STAGES=cost STOP_AT=100000 WORKERS=1` of the same script (`cost.csv`)" if args.cost else ""
-    )
+    flags = "".join(f" --{name} {value}" for name, value in (("cost", args.cost), ("known", args.known)) if value)
+    timed = "; the cost is from `STAGES=cost STOP_AT=100000 WORKERS=1` of the same script (`cost.csv`)"
     hours = sum(row["steps"] * row["seconds_per_step"] for row in rows if "seconds_per_step" in row) / 3600
+    gone = f" {old} of the runs are those of an earlier report, whose folders are gone; " if old else ""
+    without = "curves are drawn from the runs that have them." if old else ""
     return (
         f"`benchmark/ppo_kle.sh`, ppo_continuous_kle.py at {', '.join(made_at)}; `python benchmark/report.py --steps "
-        f"{args.steps}{cost}` at {commit()}. {hours:.1f} core-hours of training, one thread each{timed}.\n\n"
-        f"{coverage(rows, args.steps)}\n\n"
+        f"{args.steps}{flags}` at {commit()}. {hours:.1f} core-hours of training, one thread each"
+        f"{timed if was_timed_alone(args) else ''}.{gone}{without}\n\n{coverage(rows, args.steps)}\n\n"
     )
 
 
@@ -768,22 +806,49 @@ def tables(rows: list[dict], timed: list[dict], steps: int) -> dict[str, list[li
     return made
 
 
+def was_timed_alone(args: Args) -> bool:
+    """Whether the cost is from runs with nothing beside them, in this report or in the earlier one."""
+    return bool(args.cost or args.known and (args.known / "cost.csv").exists())
+
+
+def timed_runs(args: Args, found: list[dict]) -> list[dict]:
+    """The rows that the cost is from: of runs timed alone, of the earlier report's, or of all runs."""
+    if args.cost:
+        return [run["row"] for run in in_order(read_runs(args.cost, args.steps, args.workers), [])]
+    if was_timed_alone(args):
+        with open(args.known / "cost.csv", newline="") as file:
+            return [{key: number(key, value) for key, value in row.items()} for row in csv.DictReader(file)]
+    return [run["row"] for run in found]
+
+
+def write_runs(out: Path, runs: list[dict]) -> None:
+    """`runs.csv` and `curves.npz`, from which a later report can go on."""
+    rows = [run["row"] for run in runs]
+    write_csv(out / "runs.csv", [{key: row.get(key, "") for key in rows[0] | {"seconds_per_step": ""}} for row in rows])
+    curves = {run_name(run["row"]): np.array([*run["curves"].values()], np.float32) for run in runs if run["curves"]}
+    np.savez_compressed(out / "curves.npz", **curves)
+
+
 def main(args: Args) -> None:
     found = read_runs(args.runs, args.steps, args.workers)
-    runs = [run for run in found if "curves" in run]
+    of_folders = [run for run in found if "curves" in run]
+    known = read_known(args.known) if args.known else []
+    runs = in_order(of_folders, known)
     if not runs:
         raise SystemExit(f"--runs {args.runs}: holds no run of {args.steps:,} steps")
     out = args.out or ROOT / "benchmark" / "results" / "ppo_kle" / f"{args.steps}"
     out.mkdir(parents=True, exist_ok=True)
+    timed = timed_runs(args, in_order(found, known))
+    write_runs(out, runs)
     rows = [run["row"] for run in runs]
-    write_csv(out / "runs.csv", [{key: row.get(key, "") for key in rows[0] | {"seconds_per_step": ""}} for row in rows])
     for definition in SCORES:
         normalise(rows, definition)
-    timed = [run["row"] for run in (read_runs(args.cost, args.steps, args.workers) if args.cost else found)]
-    if args.cost:
+    if was_timed_alone(args):
         write_csv(out / "cost.csv", [{key: row[key] for key in COST} for row in timed if "seconds_per_step" in row])
     made = tables(rows, timed, args.steps)
-    text = provenance(rows, args) + "\n".join(f"## {name}\n\n{markdown(lines)}" for name, lines in made.items())
+    text = provenance(rows, args, len(runs) - len(of_folders)) + "\n".join(
+        f"## {name}\n\n{markdown(lines)}" for name, lines in made.items()
+    )
     (out / "tables.md").write_text(text)
     (out / "tables.tex").write_text("\n".join(latex(lines, name) for name, lines in made.items()))
     figures = {"fig_4_1": figure_4_1(runs, "as written", args.steps), "fig_4_2": figure_4_2(rows, "as written")}

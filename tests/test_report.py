@@ -285,3 +285,31 @@ def test_a_setting_without_all_tasks_is_compared_with_none(rows):
     assert "[" not in lines["PPO"][2] and float(lines["PPO"][2]) > 0
     before, after = (report.heat_map(each, "as written").axes[0].images[0].get_array() for each in (rows, part))
     assert not np.ma.is_masked(before[5, 4]) and np.isnan(np.ma.filled(after, np.nan)[5, 4])
+
+
+def test_runs_whose_folders_are_gone_count_on(study, tmp_path):
+    report.main(report.Args(runs=study, steps=102_400, out=tmp_path / "whole", workers=1))
+    shutil.copytree(study, tmp_path / "runs")
+    report.main(report.Args(runs=tmp_path / "runs", steps=102_400, out=tmp_path / "out", workers=1))
+    for run in sorted((tmp_path / "runs").glob("*"))[3:]:
+        shutil.rmtree(run)
+    again = report.Args(runs=tmp_path / "runs", steps=102_400, out=tmp_path / "out", known=tmp_path / "out", workers=1)
+    report.main(again)
+    for name in ("runs.csv", "tables.tex"):
+        assert (tmp_path / "out" / name).read_text() == (tmp_path / "whole" / name).read_text()
+    whole, kept = (np.load(tmp_path / name / "curves.npz") for name in ("whole", "out"))
+    assert whole.files == kept.files and all(np.array_equal(whole[k], kept[k], equal_nan=True) for k in whole.files)
+    number = len(whole.files)
+    assert f"{number - 3} of the runs are those of an earlier report" in (tmp_path / "out" / "tables.md").read_text()
+
+
+def test_an_earlier_report_without_curves(study, tmp_path):
+    report.main(report.Args(runs=study, steps=102_400, out=tmp_path / "out", workers=1))
+    (tmp_path / "out" / "curves.npz").unlink()
+    runs = report.read_known(tmp_path / "out")
+    assert not any(run["curves"] for run in runs) and {run["row"]["d_target"] for run in runs} == {"", 0.03, 0.05}
+    (tmp_path / "none").mkdir()
+    report.main(
+        report.Args(runs=tmp_path / "none", steps=102_400, out=tmp_path / "out", known=tmp_path / "out", workers=1)
+    )
+    assert (tmp_path / "out" / "learning_curves.png").exists()
