@@ -11,7 +11,7 @@ METHODS = sorted(
 # (name, file): one line that says why it differs there; files with the same line have to be equal
 PPO, DQN, DISTILL = "ppo_continuous_kle.py", "dqn_apple.py", "distill_hybrid.py"
 DDPG, GAIL = "ddpg_torcs_like.py", "gail_hybrid.py"
-ROOMS, HWM = "ppo_fourrooms.py", "hwm_segment.py"
+ROOMS, HWM, DREAMER = "ppo_fourrooms.py", "hwm_segment.py", "dreamer_v2.py"
 DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's two files
     "FPS": "control steps a second",
     "make_env": "bounded Box actions, and the options of the driving task",
@@ -69,6 +69,12 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("read_demonstrations", HWM): "any environment with rooms",
     ("read_episode", HWM): "images, states and rooms",
     ("split_episodes", HWM): "by pairs",
+    ("Player", DREAMER): "holds what the world model believes",
+    ("Collector", DREAMER): "plays with the world model, into the replay",
+    ("make_env", DREAMER): "the side of the frames",
+    ("mlp", DREAMER): "SiLU, with layer normalisation where asked for; starts at zero",
+    ("balanced", DREAMER): "categorical distributions, which are logits",
+    ("play", DREAMER): "keeps what the world model believes",
 }
 OWN = {  # each method's own by design
     *("Args", "Agent", "complete_args", "main", "evaluate", "finish_run", "plot_learning_curve", "print_table"),

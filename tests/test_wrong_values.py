@@ -6,6 +6,7 @@ from conftest import assert_refused
 from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_apple as dqn
+from cleanrl_thesis import dreamer_v2 as dreamer
 from cleanrl_thesis import gail_hybrid as gail
 from cleanrl_thesis import hwm_segment as hwm
 from cleanrl_thesis import ppo_fourrooms as rooms
@@ -91,7 +92,29 @@ BAD_HWM = [
     (["--demos", "x", "--no-such-flag"], ["--no-such-flag"]),
     (["--demos", "x", "--resume"], ["--resume", "--run-dir"]),
 ]
-BAD = {dqn: BAD_DQN, distill: BAD_DISTILL, ddpg: BAD_DDPG, gail: BAD_GAIL, rooms: BAD_ROOMS, hwm: BAD_HWM}
+BAD_DREAMER = [
+    (["--env-id", "MiniGrid-FourRooms-v0"], ["--env-id", "MiniGrid-FourRooms-v0", "FourRooms11-v0"]),
+    (["--size", "huge"], ["--size", "huge", "thesis"]),
+    (["--encoder", "cnn"], ["--frame-side", "22", "64", "--encoder cnn"]),
+    (["--frame-side", 21], ["--frame-side", "21", "even"]),
+    (["--num-envs", 7], ["--num-envs", "7", "divide 500"]),
+    (["--prefill", 750], ["--prefill", "750", "500"]),
+    (["--prefill", 500, "--chunk-length", 50], ["--prefill", "500", "--chunk-length"]),
+    (["--total-timesteps", 0], ["--total-timesteps", "0"]),
+    (["--classes", 1], ["--classes", "1", "at least 2"]),
+    (["--ent-coef", "-1"], ["--ent-coef", "-1.0"]),
+    (["--gamma", "nan"], ["--gamma", "nan"]),
+    (["--resume"], ["--resume", "--run-dir"]),
+]
+BAD = {
+    dqn: BAD_DQN,
+    distill: BAD_DISTILL,
+    ddpg: BAD_DDPG,
+    gail: BAD_GAIL,
+    rooms: BAD_ROOMS,
+    hwm: BAD_HWM,
+    dreamer: BAD_DREAMER,
+}
 
 
 @pytest.mark.parametrize(

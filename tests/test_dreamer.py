@@ -1,0 +1,526 @@
+"""DreamerV2: its functions against independent sources, small worlds whose values are known, and small runs."""
+
+import csv
+import json
+import shutil
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from conftest import ROOT, kill_twice, needs_compiler, run
+
+from cleanrl_thesis import dreamer_v2 as method
+
+SCRIPT = ROOT / "cleanrl_thesis" / "dreamer_v2.py"
+CPU = torch.device("cpu")
+TINY = {"deter": 12, "stoch": 3, "classes": 4, "hidden_size": 16, "head_size": 16, "depth": 2, "batch_size": 3}
+TINY |= {"chunk_length": 6, "starts": 8, "horizon": 4}
+FLAGS = [part for name, value in TINY.items() for part in (f"--{name.replace('_', '-')}", value)]
+# 500 random steps, then 25 updates in each of two blocks, a checkpoint after each
+SMALL = [*FLAGS, "--total-timesteps", 1500, "--prefill", 500, "--train-frequency", 20, "--checkpoint-interval", 500]
+SMALL += ["--eval-episodes", 4, "--kl-warmup", 20]
+
+
+def make_args(**changes) -> method.Args:
+    return method.complete_args(method.Args(**{**TINY, "prefill": 500, "total_timesteps": 1000, **changes}))
+
+
+def make_learner(**changes) -> method.Learner:
+    args = make_args(**changes)
+    torch.manual_seed(0)
+    model = method.WorldModel(args, 3)
+    method.set_frame_statistics(model, args)
+    return method.Learner(args, model, CPU)
+
+
+def make_collector(tmp_path, learner: method.Learner, steps: int = 60) -> method.Collector:
+    args = learner.args
+    replay = method.Replay(tmp_path / "replay.dat", args)
+    collector = method.Collector(args, replay, method.Player(learner, args.num_envs))
+    collector.reset()
+    for _ in range(steps):
+        collector.step(randomly=True)
+    return collector
+
+
+def wake(module: torch.nn.Module) -> None:
+    """Give heads that start at zero something to say."""
+    torch.manual_seed(5)
+    for parameter in module.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+
+
+# The replay
+def test_the_replay_holds_what_was_played(tmp_path):
+    """A row is a game's episodes one after the other: played again by MiniGrid's own rules, each record agrees."""
+    collector = make_collector(tmp_path, make_learner(), steps=150)
+    replay, maze, ends = collector.replay, method.maze(11), 0
+    for row, length in zip(replay.rows, replay.lengths):
+        steps = 0
+        for t in range(length):
+            record = row[t]
+            if record["first"]:
+                assert (record["action"], record["reward"], record["terminal"]) == (0, 0, 0)
+                assert (record["pose"], record["goal"]) in {tuple(start) for start in maze.starts}
+                steps = 0
+                continue
+            steps += 1
+            assert record["pose"] == maze.moves[row[t - 1]["pose"], record["action"]]
+            assert record["goal"] == row[t - 1]["goal"]
+            reached = record["pose"] // 4 == record["goal"]
+            assert record["terminal"] == reached
+            assert record["reward"] == np.float32(1 - 0.9 * steps / 100 if reached else 0)
+            is_last = reached or steps == 100
+            assert t + 1 == length or row[t + 1]["first"] == is_last
+            ends += is_last
+    assert ends >= 10
+
+
+def test_chunks_are_pieces_of_the_rows(tmp_path):
+    """Frames of the states, the action that led to each, `first` at the chunk's begin and where an episode begins."""
+    collector = make_collector(tmp_path, make_learner(), steps=150)
+    replay = collector.replay
+    replay.rows["reward"] = np.arange(replay.rows.size).reshape(replay.rows.shape)  # a name for each place
+    painter, inner, places = method.painter(11, 22), 0, []
+    for _ in range(200):
+        data = replay.sample(CPU)
+        assert data.frames.shape == (6, 3, 22, 22, 3) and data.frames.dtype == torch.uint8
+        for b in range(3):
+            game, begin = divmod(int(data.rewards[0, b]), replay.rows.shape[1])
+            rows = replay.rows[game, begin : begin + 6]
+            assert begin + 6 <= replay.lengths[game]
+            assert data.rewards[:, b].tolist() == rows["reward"].tolist()
+            assert data.actions[:, b].tolist() == rows["action"].tolist()
+            assert data.terminals[:, b].tolist() == rows["terminal"].tolist()
+            assert data.first[:, b].tolist() == [1, *rows["first"][1:].tolist()]
+            frames = painter.draw(rows["pose"].astype(int), rows["goal"].astype(int))
+            assert np.array_equal(data.frames[:, b].numpy(), frames)
+            inner += int(rows["first"][1:].sum())
+            places.append(begin / (replay.lengths[game] - 5))
+    assert inner > 0 and abs(np.mean(places) - 0.5) < 0.05 and min(places) < 0.02 and max(places) > 0.98
+
+
+# The model
+def test_tiles_are_squares_of_two_by_two_pixels():
+    """The encoder is a convolution of stride 2; the decoder puts each tile where the encoder has it."""
+    torch.manual_seed(0)
+    encoder, frames = method.TileEncoder(10, 4), torch.randn(3, 10, 10, 3)
+    kernel = encoder.map.weight.view(4, 2, 2, 3).permute(0, 3, 1, 2)
+    expected = F.conv2d(frames.permute(0, 3, 1, 2), kernel, encoder.map.bias, stride=2)
+    assert torch.allclose(encoder(frames), F.silu(expected).permute(0, 2, 3, 1).flatten(1), atol=1e-5)
+    decoder = method.TileDecoder(5, 10, 4)
+    tiles = decoder.spread(torch.ones(1, 5)).view(5, 5, 4).permute(2, 0, 1)[None]
+    kernel = decoder.map.weight.view(2, 2, 3, 4).permute(3, 2, 0, 1)
+    expected = F.conv_transpose2d(tiles, kernel, stride=2) + decoder.map.bias.view(2, 2, 3).permute(2, 0, 1).repeat(
+        1, 5, 5
+    )
+    assert torch.allclose(decoder(torch.ones(1, 5)), expected.permute(0, 2, 3, 1), atol=1e-5)
+
+
+@pytest.mark.parametrize("size", ["xs", "s", "m", "thesis"])
+def test_sizes(size):
+    args = method.complete_args(method.Args(size=size))
+    if size == "thesis":
+        assert args.stoch * args.classes + args.deter == 1_624  # section 3.4 and the Q&A
+        args.depth = args.hidden_size = args.head_size = 8  # the shapes are what is looked at
+    model = method.WorldModel(args, 3)
+    frames = torch.zeros(2, args.frame_side, args.frame_side, 3)
+    assert model.embedding(frames).shape == (2, args.hidden_size)
+    assert model.decoder(torch.zeros(2, model.feature_size)).shape == frames.shape
+
+
+def test_draws_follow_the_probabilities_and_carry_their_gradient():
+    logits = torch.log(torch.tensor([0.6, 0.3, 0.1])).repeat(50_000, 1).requires_grad_()
+    drawn = method.straight_through(logits, torch.rand(50_000))
+    assert ((drawn.detach() - 1).abs() < 1e-6).sum() == 50_000 and torch.allclose(
+        drawn.sum(-1), torch.ones(50_000), atol=1e-5
+    )
+    assert torch.allclose(drawn.detach().mean(0), torch.tensor([0.6, 0.3, 0.1]), atol=0.01)
+    weights = torch.tensor([1.0, -2.0, 3.0])
+    (drawn[0] @ weights).backward()
+    again = logits.detach()[0].requires_grad_()
+    (again.softmax(-1) @ weights).backward()
+    assert torch.allclose(logits.grad[0], again.grad, atol=1e-6)
+
+
+def test_kl_against_torch_distributions():
+    torch.manual_seed(0)
+    q, p = torch.randn(5, 3, 4), torch.randn(5, 3, 4)
+    categorical = torch.distributions.OneHotCategorical
+    expected = torch.distributions.kl_divergence(categorical(logits=q), categorical(logits=p)).sum(-1)
+    assert torch.allclose(method.kl_categorical(q, p), expected, atol=1e-5)
+    q, p = q.requires_grad_(), p.requires_grad_()
+    value = method.balanced(method.kl_categorical, q, p, 0.8)
+    assert torch.allclose(value, expected, atol=1e-5)
+    gradients = torch.autograd.grad(value.sum(), (q, p))
+    whole = torch.autograd.grad(method.kl_categorical(q, p).sum(), (q, p))
+    assert torch.allclose(gradients[0], 0.2 * whole[0], atol=1e-6) and torch.allclose(
+        gradients[1], 0.8 * whole[1], atol=1e-6
+    )
+
+
+def test_an_episode_forgets_the_one_before_and_nothing_of_its_own():
+    """`first` masks the state and action before the step at which it stands, not one step early or late."""
+    learner = make_learner()
+    model = learner.model
+    embed, actions = torch.randn(6, 2, 16), F.one_hot(torch.randint(3, (6, 2)), 3).float()
+    first = torch.zeros(6, 2)
+    first[0], first[3, 0] = 1, 1
+
+    def deter(embed, actions):
+        torch.manual_seed(1)
+        return model.observe(embed, actions, first).state.deter
+
+    plain = deter(embed, actions)
+    for t in range(3):  # the past of step 3 in chunk 0 is forgotten, that in chunk 1 is not
+        changed = embed.clone()
+        changed[t] += 5
+        after = deter(changed, actions)
+        assert torch.equal(after[3:, 0], plain[3:, 0]) and not torch.equal(after[3:, 1], plain[3:, 1])
+        assert torch.equal(after[: t + 1], plain[: t + 1])
+        if t < 2:
+            assert not torch.equal(after[t + 1 : 3, 0], plain[t + 1 : 3, 0])
+    changed = actions.clone()
+    changed[3] = 1 - changed[3]  # the action before an episode's first frame is of the episode before
+    after = deter(embed, changed)
+    assert torch.equal(after[3, 0], plain[3, 0]) and not torch.equal(after[3, 1], plain[3, 1])
+
+
+def test_loss_is_the_sum_of_its_parts(tmp_path):
+    learner = make_learner(kl_balance=0.5, reward_scale=3.0)
+    wake(learner.model)
+    data = make_collector(tmp_path, learner).replay.sample(CPU)
+    data.rewards[2, 1], data.terminals[2, 1] = 0.7, 1.0
+    torch.manual_seed(3)
+    loss, states, parts = method.world_model_loss(learner.model, data, 0.5)
+    torch.manual_seed(3)
+    model, frames = learner.model, learner.model.normalize(data.frames)
+    embed = model.embedding(frames.flatten(0, 1)).unflatten(0, (6, 3))
+    made = model.observe(embed, F.one_hot(data.actions, 3).float(), data.first)
+    features = torch.cat([made.state.stoch, made.state.deter], -1)
+    assert torch.equal(features, states.features())
+    image = reward = discount = kl = 0.0
+    for t in range(6):
+        for b in range(3):
+            image += 0.5 * (model.decoder(features[t, b][None])[0] - frames[t, b]).square().sum()
+            predicted, goes_on = model.outcome(features[t, b])
+            reward += 0.5 * (predicted - data.rewards[t, b]) ** 2
+            discount -= torch.log(1 - goes_on if data.terminals[t, b] else goes_on)
+            kl += method.kl_categorical(made.posterior[t, b], made.prior[t, b])
+    total = (0.25 * image + 3 * reward + 5 * discount + 0.5 * kl) / 18
+    assert loss.item() == pytest.approx(total.item(), rel=1e-4)
+    assert parts["losses/image"].item() == pytest.approx(image.item() / 18, rel=1e-4)
+
+
+def test_frames_are_normalised():
+    """The mean over all starts is 0; every channel that is not dim has size 1."""
+    learner, starts = make_learner(), method.maze(11).starts
+    frames = torch.from_numpy(method.painter(11, 22).draw(starts[:, 0], starts[:, 1]))
+    x = learner.model.normalize(frames).double()
+    assert x.mean(0).abs().max() < 1e-2
+    sizes = x.square().mean((0, 1, 2)).sqrt()
+    assert sizes.max() == pytest.approx(1, abs=1e-2) and sizes.min() > 0.05
+
+
+# Returns and the dream
+def brute_force_return(rewards, discounts, values, gae_lambda, h) -> float:
+    """The mean of all n-step returns from step h, weighed by (1 − λ) λ^(n − 1), the rest on the longest (Sutton & Barto)."""
+    horizon, total = len(rewards), 0.0
+    for n in range(1, horizon - h + 1):
+        value, weight = 0.0, 1.0
+        for k in range(h, h + n):
+            value += weight * rewards[k]
+            weight *= discounts[k]
+        value += weight * values[h + n]
+        share = gae_lambda ** (n - 1) * (1 - gae_lambda if n < horizon - h else 1)
+        total += share * value
+    return total
+
+
+@pytest.mark.parametrize("terminal", [None, *range(6)])
+def test_lambda_return_by_brute_force(terminal):
+    rng = np.random.default_rng(0)
+    rewards, discounts, values = rng.normal(size=(6, 2)), 0.97 * rng.random((6, 2)), rng.normal(size=(7, 2))
+    if terminal is not None:
+        discounts[terminal] = 0
+    tensors = [torch.from_numpy(array) for array in (rewards, discounts, values)]
+    returns = method.lambda_return(*tensors, 0.9).numpy()
+    for h in range(6):
+        for n in range(2):
+            expected = brute_force_return(rewards[:, n], discounts[:, n], values[:, n], 0.9, h)
+            assert returns[h, n] == pytest.approx(expected)
+    if terminal is not None:  # nothing behind the end counts
+        assert returns[terminal] == pytest.approx(rewards[terminal])
+
+
+def test_the_action_that_reaches_the_goal_has_its_weight():
+    """The weight of state h is that the dream goes on up to h; the end at h + 1 takes nothing from action h."""
+    discounts = torch.tensor([[0.9], [0.0], [0.9], [0.9]])  # state 2 is the end
+    assert method.dream_weights(discounts).squeeze(1).tolist() == pytest.approx([1, 0.9, 0, 0])
+
+
+class ChainState(NamedTuple):
+    place: torch.Tensor  # (N, 5) one-hot
+
+    def features(self) -> torch.Tensor:
+        return self.place
+
+
+class Chain(torch.nn.Module):
+    """Places 0 to 4; action 1 leads up, 0 down; to arrive at 4 pays 1 and ends the episode."""
+
+    feature_size, num_actions = 5, 2
+
+    def __init__(self):
+        super().__init__()
+        self.unused = torch.nn.Parameter(torch.zeros(1))
+
+    def noise(self, *shape):
+        return torch.zeros(*shape, 1)
+
+    def imagine_step(self, state, action, noise):
+        place = (state.place.argmax(-1) + 2 * action.argmax(-1) - 1).clamp(0, 4)
+        return ChainState(F.one_hot(place, 5).float())
+
+    def outcome(self, features):
+        return features[..., 4], 1 - features[..., 4]
+
+
+def chain_starts() -> ChainState:
+    return ChainState(torch.eye(5)[:4].repeat(8, 1))
+
+
+def test_actions_are_scored_at_the_states_where_they_are_taken():
+    """Log-probabilities of action h at features h, the return of h + 1 on: one update raises what leads to the goal."""
+    torch.manual_seed(0)
+    behaviour = method.Behaviour(make_args(), 5, 2)
+    actions = F.one_hot(torch.tensor([[1], [1]]), 2).float()
+    features = torch.eye(5)[[2, 3, 4]][:, None]
+    dream = method.Dream(features, actions, torch.tensor([[0.0], [1.0]]), torch.tensor([[0.9], [0.0]]))
+    loss, _, _ = method.behaviour_loss(behaviour, dream, 1.0, 0.0)
+    loss.backward()
+    log_policy = behaviour.actor(features[:-1]).log_softmax(-1)[..., 1]  # advantages 0.9 and 1, weights 1 and 0.9
+    expected = -(log_policy[0] * 0.9 + 0.9 * log_policy[1] * 1.0).sum() / 2
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_critic_and_actor_on_a_chain():
+    """Actor and critic come to the best policy and to its values, γ^(3 − place)."""
+    args = make_args(gamma=0.9, horizon=8, head_size=32, slow_interval=20, ent_coef=1e-3)
+    torch.manual_seed(0)
+    learner = method.Learner(args, Chain(), CPU)
+    for _ in range(1_500):
+        learner.learn_behaviour(chain_starts())
+    with torch.no_grad():
+        values, policy = (
+            learner.behaviour.value(torch.eye(5)[:4]),
+            learner.behaviour.policy(torch.eye(5)[:4]).softmax(-1),
+        )
+    assert torch.allclose(values, torch.tensor([0.729, 0.81, 0.9, 1.0]), atol=0.04), values
+    assert (policy[:, 1] > 0.95).all(), policy
+
+
+class RoomState(NamedTuple):
+    pose: torch.Tensor  # (N,)
+    goal: torch.Tensor  # (N,)
+
+    def features(self) -> torch.Tensor:
+        """One-hot cell, direction and goal; scaled, for a first layer makes little of single ones."""
+        return (
+            8
+            * torch.cat(
+                [F.one_hot(self.pose // 4, 68), F.one_hot(self.pose % 4, 4), F.one_hot(self.goal, 68)], -1
+            ).float()
+        )
+
+
+class Rooms(torch.nn.Module):
+    """The true dynamics of FourRooms11 in the place of the world model; a reward does not know of the time."""
+
+    feature_size, num_actions = 140, 3
+
+    def __init__(self):
+        super().__init__()
+        self.unused = torch.nn.Parameter(torch.zeros(1))
+        self.moves = torch.from_numpy(method.maze(11).moves)
+
+    def noise(self, *shape):
+        return torch.zeros(*shape, 1)
+
+    def imagine_step(self, state, action, noise):
+        return RoomState(self.moves[state.pose, action.argmax(-1)], state.goal)
+
+    def outcome(self, features):
+        reached = (features[..., :68].argmax(-1) == features[..., 72:].argmax(-1)).float()
+        return reached, 1 - reached
+
+
+def true_return(behaviour: method.Behaviour) -> float:
+    """Mean return of the greedy policy from all starts, by tables."""
+    maze = method.maze(11)
+    pose, goal = torch.from_numpy(maze.starts.T.copy())
+    returns, ended = torch.zeros(len(pose)), torch.zeros(len(pose), dtype=torch.bool)
+    for step in range(1, 101):
+        with torch.no_grad():
+            action = behaviour.policy(RoomState(pose, goal).features()).argmax(-1)
+        pose = torch.from_numpy(maze.moves)[pose, action]
+        reached = (pose // 4 == goal) & ~ended
+        returns[reached] = 1 - 0.9 * step / 100
+        ended |= reached
+    return float(returns.mean())
+
+
+@pytest.mark.slow
+def test_policy_learning_in_the_true_dynamics_solves_the_maze():
+    """The second instrument of the study: the same actor, critic and returns, with nothing to blame on the model."""
+    args = method.complete_args(method.Args(actor_learning_rate=1e-3))
+    torch.manual_seed(0)
+    learner, maze = method.Learner(args, Rooms(), CPU), method.maze(11)
+    cells = np.flatnonzero(maze.rooms < 4)
+    for _ in range(6_000):
+        pose, goal = (
+            torch.randint(4 * len(maze.cells), (128,)),
+            torch.from_numpy(cells)[torch.randint(len(cells), (128,))],
+        )
+        goal = torch.where(pose // 4 == goal, torch.tensor(cells[0]), goal)
+        learner.learn_behaviour(RoomState(pose, goal))
+    value = true_return(learner.behaviour)
+    assert value >= 0.85, value
+
+
+# Runs
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dreamer")
+    run(*SMALL, "--run-dir", "run", "--save-model", cwd=folder, script=SCRIPT)
+    return folder / "run"
+
+
+def test_small_run_leaves_its_records(small_run):
+    rows = list(csv.DictReader((small_run / "updates.csv").read_text().splitlines()))
+    assert [row["global_step"] for row in rows] == ["1000", "1500"]
+    result = json.loads((small_run / "result.json").read_text())
+    assert result["complete"] and result["updates"] == 50
+    evaluation = json.loads((small_run / "evaluation.json").read_text())
+    assert evaluation["mode"] == "greedy" and evaluation["episodes"] == 4 and 0.7 < evaluation["optimal"] < 0.99
+    assert 0 <= evaluation["eval/real_return"] < 1
+    for name in ("learning_curve.png", "dream.png"):
+        assert (small_run / name).read_bytes()[1:4] == b"PNG"
+
+
+def assert_same_states(left, right) -> None:
+    for name in ("episodes.csv", "updates.csv", "evaluation.json"):
+        assert (left / name).read_bytes() == (right / name).read_bytes(), name
+    states = [torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (left, right)]
+
+    def compare(a, b, path=""):
+        if isinstance(a, dict):
+            assert a.keys() == b.keys()
+            for key in a:
+                compare(a[key], b[key], f"{path}/{key}")
+        elif isinstance(a, list):
+            for i, (x, y) in enumerate(zip(a, b, strict=True)):
+                compare(x, y, f"{path}/{i}")
+        else:
+            assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, path
+
+    for name in ("learner", "collector", "torch_rng", "global_step"):
+        compare(states[0][name], states[1][name], name)
+    lengths = states[0]["collector"]["lengths"].tolist()
+    rows = [np.fromfile(folder / "replay.dat", method.RECORD).reshape(len(lengths), -1) for folder in (left, right)]
+    for game, length in enumerate(lengths):
+        assert np.array_equal(rows[0][game, :length], rows[1][game, :length])
+
+
+def test_same_seed_same_bytes_and_another_seed_others(small_run, tmp_path):
+    run(*SMALL, "--run-dir", "again", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(small_run, tmp_path / "again")
+    run(*SMALL, "--run-dir", "other", "--seed", 2, cwd=tmp_path, script=SCRIPT)
+    assert (small_run / "updates.csv").read_bytes() != (tmp_path / "other" / "updates.csv").read_bytes()
+
+
+@pytest.mark.parametrize("torn", [False, True])
+@pytest.mark.parametrize("stop_at", [500, 1000])
+def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path, torn, stop_at):
+    flags = [*SMALL, "--run-dir", "run", "--resume"]
+    run(*flags, "--stop-at", stop_at, cwd=tmp_path, script=SCRIPT)
+    if torn:  # the one before it is taken, or the run starts anew; the records are cut back
+        path = tmp_path / "run" / "checkpoint.pt"
+        if not (tmp_path / "run" / "checkpoint.previous.pt").exists():
+            shutil.copy(path, tmp_path / "run" / "checkpoint.previous.pt")
+        path.write_bytes(path.read_bytes()[:1000])
+        with open(tmp_path / "run" / "episodes.csv", "a") as file:
+            file.write("999,0,1\n")
+    run(*flags, cwd=tmp_path, script=SCRIPT)
+    assert_same_states(small_run, tmp_path / "run")
+
+
+@needs_compiler
+def test_compiled_and_plain_agree(tmp_path):
+    """The same batch, the same draws: parts of the losses, and parameters after three updates."""
+    results = []
+    for compiles in (False, True):
+        learner = make_learner(compile=compiles)
+        wake(learner.behaviour)
+        folder = tmp_path / str(compiles)
+        folder.mkdir()
+        replay = make_collector(folder, learner).replay
+        assert not compiles or method.compile_steps(learner, replay.example(CPU))
+        torch.manual_seed(7)
+        parts = [learner.update(replay.sample(CPU)) for _ in range(3)]
+        weights = torch.cat([value.detach().flatten() for value in learner.behaviour.actor.parameters()])
+        results.append(({name: value.item() for name, value in parts[-1].items()}, weights))
+    for name, value in results[0][0].items():
+        assert results[1][0][name] == pytest.approx(value, rel=1e-3, abs=1e-4), name
+    assert torch.allclose(results[0][1], results[1][1], atol=1e-3)
+
+
+def test_bfloat16_stays_near_float32(tmp_path):
+    """The losses of the same batch and draws, but for rounding."""
+    learner = make_learner(size="m", encoder="cnn", frame_side=64)
+    data = make_collector(tmp_path, learner, steps=20).replay.sample(CPU)
+    losses = []
+    for learner.args.bf16 in (False, True):
+        torch.manual_seed(1)
+        with learner.arithmetic():
+            losses.append(method.world_model_loss(learner.model, data, 1.0)[0].item())
+    assert losses[1] == pytest.approx(losses[0], rel=0.02)
+
+
+def test_copied_alone(small_run, tmp_path):
+    (tmp_path / "mine.py").write_text(SCRIPT.read_text())
+    run(*SMALL, "--run-dir", "run", cwd=tmp_path, script=tmp_path / "mine.py", PYTHONSAFEPATH="1")
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+
+
+def test_a_folder_of_another_run_is_refused(small_run, tmp_path):
+    words = ["--seed 2 (was 1)", "must be as in"]
+    done = run(*SMALL, "--run-dir", small_run, "--resume", "--seed", 2, cwd=tmp_path, code=2, script=SCRIPT)
+    assert all(word in done.stderr for word in words) and done.stderr.count("\n") == 1
+
+
+def test_losses_that_explode_end_the_run(tmp_path):
+    flags = [*SMALL, "--model-learning-rate", 1e30, "--max-grad-norm", "inf", "--run-dir", "run"]
+    done = run(*flags, cwd=tmp_path, code=1, script=SCRIPT)
+    assert "no longer finite" in done.stderr and not (tmp_path / "run" / "result.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_runs_end_with_the_same_bytes(tmp_path, seed):
+    flags = [*SMALL, "--total-timesteps", 5_000, "--seed", seed]
+    run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 12, seed, SCRIPT)
+    run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(tmp_path / "whole", tmp_path / "run")
+
+
+def test_the_dream_starts_from_what_was_seen(small_run, tmp_path):
+    """An episode's frames above those of the model: as many, and of the same size."""
+    learner = make_learner()
+    states = np.array([[0, 0, 60], [0, 1, 60], [0, 2, 60], [0, 3, 60], [0, 0, 60]])
+    truth, dream = method.dream_frames(learner, learner.args, states, np.array([1, 1, 1, 1]))
+    assert truth.shape == dream.shape == (5, 22, 22, 3) and truth.dtype == dream.dtype == np.uint8
+    assert np.array_equal(truth, method.painter(11, 22).draw(4 * states[:, 0] + states[:, 1], states[:, 2]))
