@@ -100,7 +100,7 @@ BAD_DREAMER = [
     (["--num-envs", 7], ["--num-envs", "7", "divide 500"]),
     (["--prefill", 750], ["--prefill", "750", "500"]),
     (["--prefill", 500, "--chunk-length", 50], ["--prefill", "500", "--chunk-length"]),
-    (["--total-timesteps", 0], ["--total-timesteps", "0"]),
+    (["--total-timesteps", 750], ["--total-timesteps", "750", "multiple of 500"]),
     (["--classes", 1], ["--classes", "1", "at least 2"]),
     (["--ent-coef", "-1"], ["--ent-coef", "-1.0"]),
     (["--gamma", "nan"], ["--gamma", "nan"]),
