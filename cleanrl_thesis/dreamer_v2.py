@@ -646,7 +646,7 @@ class GRUCell(nn.Module):
         return update * torch.tanh(torch.sigmoid(reset) * candidate) + (1 - update) * state
 
 
-def mlp(input_size: int, hidden_size: int, output_size: int, layers: int, norm: bool = False) -> nn.Sequential:
+def head(input_size: int, hidden_size: int, output_size: int, layers: int, norm: bool) -> nn.Sequential:
     """Densely connected layers with SiLU, each behind a layer normalisation where `norm`; the last one starts at 0."""
     sizes, modules = [input_size] + [hidden_size] * layers, []
     for a, b in zip(sizes, sizes[1:]):
@@ -773,8 +773,8 @@ class WorldModel(nn.Module):
         self.embed = nn.Linear(self.encoder.size, hidden)
         self.posterior_deter = nn.Linear(args.deter, hidden, bias=False)
         self.posterior_out = nn.Linear(hidden, stoch)
-        self.reward = mlp(self.feature_size, args.head_size, 1, args.head_layers, args.head_norm)
-        self.discount = mlp(self.feature_size, args.head_size, 1, args.head_layers, args.head_norm)
+        self.reward = head(self.feature_size, args.head_size, 1, args.head_layers, args.head_norm)
+        self.discount = head(self.feature_size, args.head_size, 1, args.head_layers, args.head_norm)
 
     def normalize(self, frames: torch.Tensor) -> torch.Tensor:
         """Frames (..., side, side, 3) uint8 -> what the model sees."""
@@ -831,6 +831,10 @@ class WorldModel(nn.Module):
         deter = self.recur(state, action)
         return State(one_hot_sample(self.prior(deter), noise).flatten(-2), deter)
 
+    def decode(self, state: State) -> torch.Tensor:
+        """States (N, ...) -> normalised frames (N, side, side, 3)."""
+        return self.decoder(state.features())
+
     def outcome(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Features (..., F) of states -> the reward on arriving there, and the probability that the episode goes on, (...)."""
         return self.reward(features).squeeze(-1).float(), torch.sigmoid(self.discount(features).squeeze(-1).float())
@@ -842,15 +846,22 @@ def kl_categorical(q: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
     return (log_q.exp() * (log_q - log_p)).sum((-1, -2))
 
 
-def balanced(kl, q: torch.Tensor, p: torch.Tensor, balance: float) -> torch.Tensor:
+def balanced(kl, q, p, balance: float) -> torch.Tensor:
     """KL[q ‖ p], whose gradient trains p with weight `balance` and q with the rest (DreamerV2)."""
-    return balance * kl(q.detach(), p) + (1 - balance) * kl(q, p.detach())
+    still = [type(x)(*(part.detach() for part in x)) if isinstance(x, tuple) else x.detach() for x in (q, p)]
+    return balance * kl(still[0], p) + (1 - balance) * kl(q, still[1])
+
+
+def kl_scale(args: Args, updates: int) -> float:
+    """The weight of the KL divergence, which grows from a tenth over `--kl-warmup` updates."""
+    share = (updates + 1) / args.kl_warmup if args.kl_warmup else 1.0
+    return args.kl_scale * min(1.0, max(0.1, share))
 
 
 def world_model_loss(
-    model: WorldModel, data: Chunks, kl_scale: float
+    model: WorldModel, data: Chunks, updates: int
 ) -> tuple[torch.Tensor, State, dict[str, torch.Tensor]]:
-    """The model's loss per step, its states (T, B, ...), and the parts of the loss."""
+    """The model's loss per step after so many updates, its states (T, B, ...), and the parts of the loss."""
     args = model.args
     frames = model.normalize(data.frames.flatten(0, 1))  # (T · B, side, side, 3)
     embed = model.embedding(frames).unflatten(0, data.first.shape)
@@ -863,7 +874,8 @@ def world_model_loss(
     goes_on = model.discount(features).squeeze(-1).float()
     discount = F.binary_cross_entropy_with_logits(goes_on, 1 - data.terminals.flatten())
     kl = balanced(kl_categorical, made.posterior, made.prior, args.kl_balance)
-    loss = args.image_scale * image + args.reward_scale * reward + args.discount_scale * discount + kl_scale * kl.mean()
+    loss = args.image_scale * image + args.reward_scale * reward + args.discount_scale * discount
+    loss = loss + kl_scale(args, updates) * kl.mean()
     inside = 1 - data.first  # a first frame costs tens of nats, which say nothing of the dynamics
     parts = {
         "image": image,
@@ -883,8 +895,8 @@ class Behaviour(nn.Module):
     def __init__(self, args: Args, feature_size: int, num_actions: int):
         super().__init__()
         heads = args.head_size, args.head_layers, args.head_norm
-        self.actor = mlp(feature_size, heads[0], num_actions, *heads[1:])
-        self.critic = mlp(feature_size, heads[0], 1, *heads[1:])
+        self.actor = head(feature_size, heads[0], num_actions, *heads[1:])
+        self.critic = head(feature_size, heads[0], 1, *heads[1:])
         self.slow_critic = copy.deepcopy(self.critic).requires_grad_(False)
 
     def policy(self, features: torch.Tensor) -> torch.Tensor:
@@ -995,10 +1007,6 @@ class Learner:
         """bfloat16 for matrix products with `--bf16`."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.args.bf16)
 
-    def kl_scale(self) -> float:
-        share = (self.updates + 1) / self.args.kl_warmup if self.args.kl_warmup else 1.0
-        return self.args.kl_scale * min(1.0, max(0.1, share))
-
     def update(self, data: Chunks) -> dict[str, torch.Tensor]:
         """One gradient step on everything (Eq. 3.3.11); returns what to log."""
         states, parts = self.learn_model(data)
@@ -1007,7 +1015,7 @@ class Learner:
     def learn_model(self, data: Chunks) -> tuple[State, dict[str, torch.Tensor]]:
         """One step of the world model; returns the states (T, B, ...) that it made, and what to log."""
         with self.arithmetic():
-            loss, states, parts = world_model_loss(self.model, data, self.kl_scale())
+            loss, states, parts = world_model_loss(self.model, data, self.updates)
         self.descend(model=loss)
         return states, parts
 
@@ -1054,7 +1062,7 @@ def compile_steps(learner: Learner, data: Chunks) -> bool:
     model.filter, model.imagine_step, behaviour.policy = map(torch.compile, plain)
     try:
         with learner.arithmetic():
-            loss, states, _ = world_model_loss(model, data, 1.0)
+            loss, states, _ = world_model_loss(model, data, 0)
             dream = imagine(model, behaviour, learner.draw_starts(states, data.terminals), 2, 1.0)
             (loss + behaviour_loss(behaviour, dream, 1.0, 0.0)[0]).backward()
     except Exception as error:  # whatever the compiler's tool chain lacks, the plain steps need none of it
@@ -1110,7 +1118,7 @@ class Player:
             embed = model.embedding(model.normalize(torch.from_numpy(frames).to(device)))
             first = torch.from_numpy(begins.astype(np.float32)).to(device)[:, None]
             state, _ = model.filter(self.state, self.action, first, embed, model.noise(len(frames)))
-        self.state = State(*(part.float() for part in state))
+        self.state = type(state)(*(part.float() for part in state))
 
     @torch.no_grad()
     def act(self, greedy: bool = False) -> np.ndarray:
@@ -1177,7 +1185,7 @@ class Collector:
             array = getattr(games, name)
             array[:] = tensor.numpy().view(array.dtype)
         *belief, self.player.action = (part.to(self.player.learner.device) for part in state["belief"])
-        self.player.state = State(*belief)
+        self.player.state = type(self.player.state)(*belief)
         self.replay.lengths[:] = state["lengths"].numpy()
         self.begins = state["begins"].numpy().copy()
         self.obs = self.envs.draw()
@@ -1459,7 +1467,7 @@ def dream_frames(
             player.observe(frame[None], np.array([t == 0]))
         else:
             player.state = model.imagine_step(player.state, player.action, model.noise(1))
-        seen.append(model.decoder(player.state.features()).float() * model.frame_scale + model.frame_mean)
+        seen.append(model.decode(player.state).float() * model.frame_scale + model.frame_mean)
         if t < len(actions):
             player.action = F.one_hot(torch.tensor([actions[t]]), model.num_actions).float().to(learner.device)
     return truth, torch.cat(seen).clamp(0, 255).round().byte().cpu().numpy()

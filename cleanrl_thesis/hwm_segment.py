@@ -162,8 +162,6 @@ class Args:
     """w starts anew from z where z is read (VTA; the thesis: no)"""
     narrow_w: bool = True
     """means of y in ±1 and a fixed noise in q(y), so that it carries few bits"""
-    narrow_z: bool = False
-    """the same for v"""
     narrow_std: float = 0.3
     """that noise"""
     decoder_sees_h: bool = False
@@ -495,14 +493,13 @@ class HWM(nn.Module):
         self.prior_m = mlp(w + z + num_actions, hidden, 1, 2)  # p(m_t | w_t, z_t, a_t)
         self.decoder = mlp(w + z, hidden, frame_size)  # p(o_t | w_t, z_t)
 
-    def distribution(self, head: NormalHead, features: torch.Tensor) -> Normal:
-        """The head's; on a narrow level its mean lies in ±1 and the posterior's σ is fixed."""
+    def low_level(self, head: NormalHead, features: torch.Tensor) -> Normal:
+        """The head's distribution; with `--narrow-w` its mean lies in ±1 and the posterior's σ is fixed."""
         mean, std = head(features)
-        is_z = head is self.prior_z or head is self.posterior_z
-        if not (self.args.narrow_z if is_z else self.args.narrow_w):
+        if not self.args.narrow_w:
             return Normal(mean, std)
-        is_posterior = head is self.posterior_z or head is self.posterior_w
-        return Normal(mean.tanh(), torch.full_like(std, self.args.narrow_std) if is_posterior else 0.2 + 0.3 * std)
+        noise = self.args.narrow_std
+        return Normal(mean.tanh(), torch.full_like(std, noise) if head is self.posterior_w else 0.2 + 0.3 * std)
 
     def draw_m(self, logits: torch.Tensor, temperature: float) -> torch.Tensor:
         """Bernoulli samples of logits (T, B) by the binary Gumbel trick, with the gradient of the soft ones."""
@@ -522,16 +519,16 @@ class HWM(nn.Module):
         """
         c = self.z_rnn(torch.cat([state.v, state.h, state.y, previous_action], -1), state.c)
         c = read * c + (1 - read) * state.c  # UPDATE or COPY
-        q_z = self.distribution(self.posterior_z, torch.cat([c, embed], -1))
+        q_z = self.posterior_z(torch.cat([c, embed], -1))
         v = q_z.mean + q_z.std * noise[0]
         if z_from_prior:  # section 3.5.1: z_0 from q, later ones from p
-            v = begins * v + (1 - begins) * self.distribution(self.prior_z, c).mean
+            v = begins * v + (1 - begins) * self.prior_z(c).mean
         v = read * v + (1 - read) * state.v
         z = torch.cat([c, v], -1)
         h = self.w_rnn(torch.cat([state.y, previous_action, z], -1), state.h)
         if self.args.w_reset:
             h = read * torch.tanh(self.w_start(z)) + (1 - read) * h
-        q_w = self.distribution(self.posterior_w, torch.cat([h, z, embed], -1))
+        q_w = self.low_level(self.posterior_w, torch.cat([h, z, embed], -1))
         y = q_w.mean + q_w.std * noise[1]
         return Belief(c, v, h, y), q_z, q_w
 
@@ -595,7 +592,7 @@ def hwm_loss(model: HWM, data: Sequence, temperature: float, budget: float) -> t
     """−J_HWM (Eq. 3.3.5) per step, and its terms; `budget` is the share of steps that may be read without a price."""
     args, made = model.args, model.infer(data, "train", temperature)
     reconstruction = 0.5 * args.image_scale * (model.decode(made.belief) - data.frames).square().sum(-1)  # (T, B)
-    p_z, p_w = model.distribution(model.prior_z, made.belief.c), model.distribution(model.prior_w, made.belief.h)
+    p_z, p_w = model.prior_z(made.belief.c), model.low_level(model.prior_w, made.belief.h)
     weight = made.reads.detach() if args.detach_kl_z else made.reads  # Eq. 3.3.7 weighs KL_z by q(M)
     kl_z = weight * balanced(kl_normal, made.q_z, p_z, args.kl_balance)
     kl_w = balanced(kl_normal, made.q_w, p_w, args.kl_balance)

@@ -72,8 +72,6 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("Player", DREAMER): "holds what the world model believes",
     ("Collector", DREAMER): "plays with the world model, into the replay",
     ("make_env", DREAMER): "the side of the frames",
-    ("mlp", DREAMER): "SiLU, with layer normalisation where asked for; starts at zero",
-    ("balanced", DREAMER): "categorical distributions, which are logits",
     ("play", DREAMER): "keeps what the world model believes",
 }
 OWN = {  # each method's own by design

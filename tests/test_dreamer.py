@@ -194,7 +194,7 @@ def test_loss_is_the_sum_of_its_parts(tmp_path):
     data = make_collector(tmp_path, learner).replay.sample(CPU)
     data.rewards[2, 1], data.terminals[2, 1] = 0.7, 1.0
     torch.manual_seed(3)
-    loss, states, parts = method.world_model_loss(learner.model, data, 0.5)
+    loss, states, parts = method.world_model_loss(learner.model, data, 499)
     torch.manual_seed(3)
     model, frames = learner.model, learner.model.normalize(data.frames)
     embed = model.embedding(frames.flatten(0, 1)).unflatten(0, (6, 3))
@@ -485,7 +485,7 @@ def test_bfloat16_stays_near_float32(tmp_path):
     for learner.args.bf16 in (False, True):
         torch.manual_seed(1)
         with learner.arithmetic():
-            losses.append(method.world_model_loss(learner.model, data, 1.0)[0].item())
+            losses.append(method.world_model_loss(learner.model, data, 1_000)[0].item())
     assert losses[1] == pytest.approx(losses[0], rel=0.02)
 
 
