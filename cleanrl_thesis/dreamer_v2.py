@@ -755,6 +755,8 @@ class Observed(NamedTuple):
 class WorldModel(nn.Module):
     """The recurrent state-space model with categorical states (Hafner et al. 2021)."""
 
+    STEPS = ("filter", "imagine_step")  # what `--compile` compiles
+
     def __init__(self, args: Args, num_actions: int):
         super().__init__()
         self.args, self.num_actions = args, num_actions
@@ -892,6 +894,8 @@ def world_model_loss(
 class Behaviour(nn.Module):
     """Actor, critic, and the slow critic that the returns are made with."""
 
+    STEPS = ("policy",)
+
     def __init__(self, args: Args, feature_size: int, num_actions: int):
         super().__init__()
         heads = args.head_size, args.head_layers, args.head_norm
@@ -920,7 +924,7 @@ class Dream(NamedTuple):
 
 
 @torch.no_grad()
-def imagine(model: WorldModel, behaviour: Behaviour, state: State, horizon: int, gamma: float) -> Dream:
+def imagine(model: nn.Module, behaviour: Behaviour, state: NamedTuple, horizon: int, gamma: float) -> Dream:
     """Dream from states (N, ...) by the actor's policy."""
     games = len(state.features())
     noise, choices = model.noise(horizon, games), uniforms(horizon, games, device=state[0].device)
@@ -973,7 +977,7 @@ def behaviour_loss(
 class Learner:
     """The world model, the behaviour, and their optimisers."""
 
-    def __init__(self, args: Args, model: WorldModel, device: torch.device):
+    def __init__(self, args: Args, model: nn.Module, device: torch.device):
         self.args, self.device, self.updates = args, device, 0
         self.model = model.to(device)
         self.behaviour = Behaviour(args, model.feature_size, model.num_actions).to(device)
@@ -1012,14 +1016,14 @@ class Learner:
         states, parts = self.learn_model(data)
         return {**parts, **self.learn_behaviour(self.draw_starts(states, data.terminals))}
 
-    def learn_model(self, data: Chunks) -> tuple[State, dict[str, torch.Tensor]]:
+    def learn_model(self, data: Chunks) -> tuple[NamedTuple, dict[str, torch.Tensor]]:
         """One step of the world model; returns the states (T, B, ...) that it made, and what to log."""
         with self.arithmetic():
             loss, states, parts = world_model_loss(self.model, data, self.updates)
         self.descend(model=loss)
         return states, parts
 
-    def learn_behaviour(self, begins: State) -> dict[str, torch.Tensor]:
+    def learn_behaviour(self, begins: NamedTuple) -> dict[str, torch.Tensor]:
         """One step of actor and critic in dreams that begin at states (N, ...); returns what to log."""
         args = self.args
         with self.arithmetic():
@@ -1031,7 +1035,7 @@ class Learner:
             self.behaviour.slow_critic.load_state_dict(self.behaviour.critic.state_dict())
         return parts
 
-    def draw_starts(self, states: State, terminals: torch.Tensor) -> State:
+    def draw_starts(self, states: NamedTuple, terminals: torch.Tensor) -> NamedTuple:
         """States (N, ...) of a batch (T, B, ...) that do not end an episode, `--starts` of them at most."""
         alive = torch.nonzero(terminals.flatten() == 0).squeeze(1)
         chosen = alive[torch.randperm(len(alive))[: self.args.starts].to(alive.device)]
@@ -1051,15 +1055,17 @@ class Learner:
 
 
 def compile_steps(learner: Learner, data: Chunks) -> bool:
-    """Compile the steps of filter and dream where a compiler is at hand; return whether that went well."""
+    """Compile the steps of model, dream and actor where a compiler is at hand; return whether that went well."""
     compiler = os.environ.get("CXX", "g++")
     if shutil.which(compiler) is None:
         print(f"--compile: no C++ compiler ({compiler}) here, goes on without", file=sys.stderr)
         return False
     model, behaviour, state = learner.model, learner.behaviour, torch.get_rng_state()
-    plain = model.filter, model.imagine_step, behaviour.policy
+    plain = [(owner, name, getattr(owner, name)) for owner in (model, behaviour) for name in owner.STEPS]
     torch.compiler.set_stance("default")
-    model.filter, model.imagine_step, behaviour.policy = map(torch.compile, plain)
+    for owner, name, step in plain:
+        setattr(owner, name, torch.compile(step))
+    works = True
     try:
         with learner.arithmetic():
             loss, states, _ = world_model_loss(model, data, 0)
@@ -1067,12 +1073,14 @@ def compile_steps(learner: Learner, data: Chunks) -> bool:
             (loss + behaviour_loss(behaviour, dream, 1.0, 0.0)[0]).backward()
     except Exception as error:  # whatever the compiler's tool chain lacks, the plain steps need none of it
         print(f"--compile: failed ({first_line(error)}), goes on without", file=sys.stderr)
-        model.filter, model.imagine_step, behaviour.policy = plain
+        for owner, name, step in plain:
+            setattr(owner, name, step)
+        works = False
     torch.set_rng_state(state)
-    return model.filter is not plain[0]
+    return works
 
 
-def set_frame_statistics(model: WorldModel, args: Args) -> None:
+def set_frame_statistics(model: nn.Module, args: Args) -> None:
     """For tiles: subtract the mean frame, and make the channels of unit size; none is magnified more than ten times."""
     if args.encoder != "tiles":
         return
@@ -1117,7 +1125,7 @@ class Player:
         with self.learner.arithmetic():
             embed = model.embedding(model.normalize(torch.from_numpy(frames).to(device)))
             first = torch.from_numpy(begins.astype(np.float32)).to(device)[:, None]
-            state, _ = model.filter(self.state, self.action, first, embed, model.noise(len(frames)))
+            state, *_ = model.filter(self.state, self.action, first, embed, model.noise(len(frames)))
         self.state = type(state)(*(part.float() for part in state))
 
     @torch.no_grad()

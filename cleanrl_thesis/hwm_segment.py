@@ -164,6 +164,8 @@ class Args:
     """means of y in ±1 and a fixed noise in q(y), so that it carries few bits"""
     narrow_std: float = 0.3
     """that noise"""
+    c_sees_w: bool = True
+    """c_t is made from w_{t-1} and a_{t-1} too (Eq. 3.3.1), not only from z_{t-1}"""
     decoder_sees_h: bool = False
     """the decoder sees h_t too (Eq. 3.3.1), not only y_t and z_t"""
     decoder_sees_c: bool = True
@@ -517,7 +519,8 @@ class HWM(nn.Module):
 
         previous_action (B, A), read and begins (B, 1), embed (B, E); noise are standard normal draws for v and y, or zeros.
         """
-        c = self.z_rnn(torch.cat([state.v, state.h, state.y, previous_action], -1), state.c)
+        low = torch.cat([state.h, state.y, previous_action], -1) * self.args.c_sees_w
+        c = self.z_rnn(torch.cat([state.v, low], -1), state.c)
         c = read * c + (1 - read) * state.c  # UPDATE or COPY
         q_z = self.posterior_z(torch.cat([c, embed], -1))
         v = q_z.mean + q_z.std * noise[0]

@@ -11,7 +11,14 @@ METHODS = sorted(
 # (name, file): one line that says why it differs there; files with the same line have to be equal
 PPO, DQN, DISTILL = "ppo_continuous_kle.py", "dqn_apple.py", "distill_hybrid.py"
 DDPG, GAIL = "ddpg_torcs_like.py", "gail_hybrid.py"
-ROOMS, HWM, DREAMER = "ppo_fourrooms.py", "hwm_segment.py", "dreamer_v2.py"
+ROOMS, HWM = "ppo_fourrooms.py", "hwm_segment.py"
+DREAMER, HWM_DREAMER = "dreamer_v2.py", "hwm_dreamer.py"
+DREAMERS = {  # of both
+    "Collector": "plays with the world model, into the replay",
+    "Player": "holds what the world model believes",
+    "make_env": "the side of the frames",
+    "play": "keeps what the world model believes",
+}
 DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's two files
     "FPS": "control steps a second",
     "make_env": "bounded Box actions, and the options of the driving task",
@@ -69,10 +76,13 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("read_demonstrations", HWM): "any environment with rooms",
     ("read_episode", HWM): "images, states and rooms",
     ("split_episodes", HWM): "by pairs",
-    ("Player", DREAMER): "holds what the world model believes",
-    ("Collector", DREAMER): "plays with the world model, into the replay",
-    ("make_env", DREAMER): "the side of the frames",
-    ("play", DREAMER): "keeps what the world model believes",
+    **{(name, file): reason for name, reason in DREAMERS.items() for file in (DREAMER, HWM_DREAMER)},
+    ("SIZES", HWM_DREAMER): "sizes of the HWM",
+    ("world_model_loss", HWM_DREAMER): "J_HWM",
+    ("Belief", HWM_DREAMER): "counts the steps of a segment",
+    ("HWM", HWM_DREAMER): "filters and dreams, by the actions before the frames; heads for reward and discount",
+    ("mlp", HWM_DREAMER): "ELU, torch's own initialisation",
+    ("schedule", HWM_DREAMER): "of updates that go on as long as the agent plays",
 }
 OWN = {  # each method's own by design
     *("Args", "Agent", "complete_args", "main", "evaluate", "finish_run", "plot_learning_curve", "print_table"),
