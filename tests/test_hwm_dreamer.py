@@ -1,0 +1,266 @@
+"""HWM Dreamer: its model against independent sources, and small runs. What it shares with the baseline is tested there."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from conftest import ROOT, kill_twice, needs_compiler, run
+from test_dreamer import assert_same_states
+
+from cleanrl_thesis import dreamer_v2
+from cleanrl_thesis import hwm_dreamer as method
+
+SCRIPT = ROOT / "cleanrl_thesis" / "hwm_dreamer.py"
+CPU = torch.device("cpu")
+TINY = {"deter_z": 5, "stoch_z": 3, "deter_w": 6, "stoch_w": 2, "hidden_size": 16, "head_size": 16, "depth": 2}
+TINY |= {"batch_size": 3, "chunk_length": 6, "starts": 8, "horizon": 4}
+FLAGS = [part for name, value in TINY.items() for part in (f"--{name.replace('_', '-')}", value)]
+SMALL = [*FLAGS, "--total-timesteps", 1500, "--prefill", 500, "--train-frequency", 20, "--checkpoint-interval", 500]
+SMALL += ["--eval-episodes", 4, "--budget-updates", 40]
+
+
+def make_args(**changes) -> method.Args:
+    return method.complete_args(method.Args(**{**TINY, "prefill": 500, "total_timesteps": 1000, **changes}))
+
+
+def make_model(**changes) -> method.HWM:
+    torch.manual_seed(0)
+    return method.HWM(make_args(**changes), 3)
+
+
+def make_data(first: list[list[int]]) -> method.Chunks:
+    """Random chunks; first (B, T) says where episodes begin."""
+    torch.manual_seed(1)
+    begins = torch.tensor(first, dtype=torch.float32).T
+    frames = torch.randint(0, 256, (*begins.shape, 22, 22, 3), dtype=torch.uint8)
+    actions = torch.randint(3, begins.shape) * (1 - begins).long()
+    return method.Chunks(frames, actions, begins, torch.rand(begins.shape), torch.zeros(begins.shape))
+
+
+def one_hot(actions: torch.Tensor) -> torch.Tensor:
+    return F.one_hot(actions, 3).float()
+
+
+@pytest.mark.parametrize("size", ["xs", "s", "m", "thesis"])
+def test_sizes_have_as_many_features_as_the_baseline(size):
+    args, baseline = method.complete_args(method.Args(size=size)), dreamer_v2.complete_args(dreamer_v2.Args(size=size))
+    features = args.deter_z + args.stoch_z + args.deter_w + args.stoch_w
+    assert features == baseline.stoch * baseline.classes + baseline.deter
+    same = "encoder frame_side depth hidden_size head_size head_layers batch_size chunk_length starts horizon gamma"
+    for name in f"{same} actor_learning_rate critic_learning_rate ent_coef adam_eps train_frequency prefill".split():
+        assert getattr(args, name) == getattr(baseline, name), name
+    if size == "thesis":
+        assert args.deter_z + args.stoch_z == args.deter_w + args.stoch_w == 812
+
+
+def test_z_is_copied_and_read_where_m_says():
+    """COPY leaves c and v as they are, UPDATE changes both; w changes with each step; `age` counts."""
+    model = make_model()
+    state = method.Belief(*(torch.randn(2, size) for size in (5, 3, 6, 2)), torch.tensor([[3.0], [4.0]]))
+    read = torch.tensor([[0.0], [1.0]])
+    after, _, _ = model.step(state, one_hot(torch.tensor([0, 2])), read, torch.randn(2, 16), model.noise(2))
+    assert torch.equal(after.c[0], state.c[0]) and torch.equal(after.v[0], state.v[0])
+    assert not torch.equal(after.c[1], state.c[1]) and not torch.equal(after.v[1], state.v[1])
+    assert not torch.isclose(after.h, state.h).any() and after.age.tolist() == [[4.0], [0.0]]
+    expected = torch.tanh(model.w_start(torch.cat([after.c, after.v], -1)))[1]
+    assert torch.allclose(after.h[1], expected)  # w starts anew from z
+    literal = make_model(w_reset=False)
+    after, _, _ = literal.step(state, one_hot(torch.tensor([0, 2])), read, torch.randn(2, 16), literal.noise(2))
+    assert not torch.allclose(after.h[1], torch.tanh(literal.w_start(torch.cat([after.c, after.v], -1)))[1])
+
+
+@pytest.mark.parametrize("logit", [-50.0, 50.0])
+def test_the_dream_reads_where_the_prior_says(logit):
+    model = make_model()
+    torch.nn.init.zeros_(model.prior_m[-1].weight)
+    torch.nn.init.constant_(model.prior_m[-1].bias, logit)
+    state = method.Belief(*(torch.randn(4, size) for size in (5, 3, 6, 2)), torch.zeros(4, 1))
+    after = model.imagine_step(state, one_hot(torch.tensor([0, 1, 2, 2])), model.noise(4))
+    assert torch.equal(after.c, state.c) == torch.equal(after.v, state.v) == (logit < 0)
+    assert (after.age == (1 if logit < 0 else 0)).all()
+
+
+def test_the_dream_draws_m_with_its_probability_and_v_and_y_from_their_priors():
+    model = make_model()
+    torch.nn.init.zeros_(model.prior_m[-1].weight)
+    torch.nn.init.constant_(model.prior_m[-1].bias, np.log(0.3 / 0.7))
+    state = method.Belief(*(torch.randn(1, size).expand(20_000, size) for size in (5, 3, 6, 2)), torch.zeros(20_000, 1))
+    after = model.imagine_step(state, one_hot(torch.zeros(20_000, dtype=torch.int64)), model.noise(20_000))
+    read = after.age[:, 0] == 0
+    assert read.float().mean().item() == pytest.approx(0.3, abs=0.015)
+    p_z = model.distribution(model.prior_z, after.c[read][:1])
+    assert torch.allclose(after.v[read].mean(0), p_z.mean[0], atol=0.02)
+    assert torch.allclose(after.v[read].std(0), p_z.std[0], atol=0.02)
+    p_w = model.distribution(model.prior_w, after.h[~read][:1])
+    assert torch.allclose(after.y[~read].mean(0), p_w.mean[0], atol=0.03)
+    assert torch.allclose(after.y[~read].std(0), p_w.std[0], atol=0.03)
+
+
+def test_acting_is_the_inference_of_training_step_by_step():
+    """`filter` with the boundaries that training drew makes the same beliefs."""
+    model, data = make_model(), make_data([[1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [1, 0, 0, 0, 0, 0]])
+    embed = model.embedding(model.normalize(data.frames.flatten(0, 1))).unflatten(0, data.first.shape)
+    torch.manual_seed(2)
+    made = model.observe(embed, one_hot(data.actions), data.first, 0.5)
+    assert 3 < made.reads.sum() < 18
+    torch.manual_seed(2)
+    model.draw_m(made.q_m, 0.5)
+    noise, state = model.noise(6, 3), model.start(3)
+    for t in range(6):
+        model.reads = lambda state, action, uniform, t=t: made.reads[t, :, None].detach()
+        state, *_ = model.filter(state, one_hot(data.actions[t]), data.first[t, :, None], embed[t], noise[t])
+        for part, whole in zip(state, made.belief):
+            assert torch.allclose(part, whole[t], atol=1e-5), t
+
+
+def test_nothing_leaks_over_the_border_of_an_episode():
+    """Beliefs, reads and logits of an episode do not change with the frames and actions of the one before."""
+    model, data = make_model(), make_data([[1, 0, 0, 1, 0, 0]])
+
+    def infer(data):
+        torch.manual_seed(3)
+        embed = model.embedding(model.normalize(data.frames.flatten(0, 1))).unflatten(0, data.first.shape)
+        made = model.observe(embed, one_hot(data.actions), data.first, 0.5)
+        return [*made.belief, made.reads, made.q_m]
+
+    changed = data._replace(frames=data.frames.clone(), actions=data.actions.clone())
+    changed.frames[:3] = 255 - changed.frames[:3]
+    changed.actions[:4] = (changed.actions[:4] + 1) % 3  # the action at its first step is of the episode before
+    for before, after in zip(infer(data), infer(changed)):
+        assert torch.equal(before[3:], after[3:])
+
+
+def test_loss_is_the_sum_of_its_terms():
+    """Eq. 3.3.5 and J_R by torch.distributions; m_t pairs with the action that followed step t."""
+    changes = {"kl_balance": 0.5, "kl_z_scale": 0.7, "kl_w_scale": 0.3, "budget_price": 0.0, "narrow_w": False}
+    model, data = make_model(**changes), make_data([[1, 0, 0, 0, 0, 0], [1, 0, 1, 0, 0, 0], [1, 0, 0, 0, 0, 1]])
+    data.terminals[1, 1] = 1
+    torch.manual_seed(4)
+    loss, belief, parts = method.world_model_loss(model, data, 10**6)
+    torch.manual_seed(4)
+    frames = model.normalize(data.frames)
+    embed = model.embedding(frames.flatten(0, 1)).unflatten(0, (6, 3))
+    made = model.observe(embed, one_hot(data.actions), data.first, model.args.temperature)
+    normal, bernoulli, kl = torch.distributions.Normal, torch.distributions.Bernoulli, torch.distributions.kl_divergence
+    total = 0.0
+    for t in range(6):
+        for b in range(3):
+            here = method.Belief(*(part[t, b][None] for part in made.belief))
+            total += 0.25 * 0.5 * (model.decode(here)[0] - frames[t, b]).square().sum()
+            if made.reads[t, b]:
+                q, p = method.Normal(*(part[t, b] for part in made.q_z)), model.prior_z(here.c)
+                total += 0.7 * kl(normal(*q), normal(p.mean[0], p.std[0])).sum()
+            q, p = method.Normal(*(part[t, b] for part in made.q_w)), model.prior_w(here.h)
+            total += 0.3 * kl(normal(*q), normal(p.mean[0], p.std[0])).sum()
+            if t < 5 and not data.first[t + 1, b]:
+                p_m = model.prior_m(torch.cat([*here[:4], one_hot(data.actions[t + 1, b])[None]], -1))[0, 0]
+                total += 0.3 * kl(bernoulli(logits=made.q_m[t, b]), bernoulli(logits=p_m)) * 18 / 15  # a mean of 5 × 3
+            reward, goes_on = model.outcome(here.features()[0])
+            total += 10 * 0.5 * (reward - data.rewards[t, b]) ** 2
+            total -= 5 * torch.log(1 - goes_on if data.terminals[t, b] else goes_on)
+    assert loss.item() == pytest.approx(total.item() / 18, rel=1e-4)
+    assert all(torch.equal(a, b) for a, b in zip(belief, made.belief))
+    decides = 1 - data.first[1:]
+    assert parts["losses/read_rate"].item() == pytest.approx(
+        (made.reads[1:] * decides).sum().item() / decides.sum().item()
+    )
+
+
+def test_reads_beyond_the_budget_cost_their_price():
+    data = make_data([[1, 0, 0, 0, 0, 0]])
+    losses = []
+    for price in (0.0, 10.0):
+        torch.manual_seed(5)
+        loss, _, parts = method.world_model_loss(make_model(budget_price=price, budget=0.1), data, 10**6)
+        losses.append(loss.item())
+    torch.manual_seed(5)
+    rate = parts["losses/read_rate"].item()
+    assert rate > 0.1 and losses[1] - losses[0] == pytest.approx(10 * (rate - 0.1), rel=1e-3)
+
+
+def test_budget_and_temperature_come_down():
+    args = make_args(budget_updates=100, budget=0.2, temperature=0.3)
+    assert method.schedule(args, 0) == (1, 1) and method.schedule(args, 50) == pytest.approx((0.65, 0.6))
+    assert method.schedule(args, 100) == method.schedule(args, 10**6) == pytest.approx((0.3, 0.2))
+
+
+def test_a_fixed_interval_reads_every_k_steps_from_an_episodes_first():
+    model, data = make_model(fixed_interval=3), make_data([[1, 0, 0, 0, 0, 0], [1, 0, 1, 0, 0, 0]])
+    embed = model.embedding(model.normalize(data.frames.flatten(0, 1))).unflatten(0, data.first.shape)
+    made = model.observe(embed, one_hot(data.actions), data.first, 1.0)
+    assert made.reads.T.tolist() == [[1, 0, 0, 1, 0, 0], [1, 0, 1, 0, 0, 1]] and made.forced.all()
+    state, ages = method.Belief(*(part[0] for part in made.belief)), []
+    for _ in range(7):
+        state = model.imagine_step(state, one_hot(torch.zeros(2, dtype=torch.int64)), model.noise(2))
+        ages.append(int(state.age[0]))
+    assert ages == [1, 2, 0, 1, 2, 0, 1]
+    loss, _, parts = method.world_model_loss(model, data, 0)
+    assert torch.isfinite(loss) and parts["losses/kl_m"] == 0
+
+
+# Runs
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hwm_dreamer")
+    run(*SMALL, "--run-dir", "run", "--save-model", cwd=folder, script=SCRIPT)
+    return folder / "run"
+
+
+def test_small_run_leaves_its_records(small_run):
+    rows = list(csv.DictReader((small_run / "updates.csv").read_text().splitlines()))
+    assert [row["global_step"] for row in rows] == ["1000", "1500"] and float(rows[0]["losses/read_rate"]) > 0
+    result = json.loads((small_run / "result.json").read_text())
+    assert result["complete"] and result["updates"] == 50
+    for name in ("learning_curve.png", "dream.png"):
+        assert (small_run / name).read_bytes()[1:4] == b"PNG"
+
+
+def test_same_seed_same_bytes(small_run, tmp_path):
+    run(*SMALL, "--run-dir", "again", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(small_run, tmp_path / "again")
+
+
+def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path):
+    for stop_at in (500, 1000, 1500):
+        run(*SMALL, "--run-dir", "run", "--resume", "--stop-at", stop_at, cwd=tmp_path, script=SCRIPT)
+    assert_same_states(small_run, tmp_path / "run")
+
+
+@pytest.mark.parametrize("flags", [["--fixed-interval", 4], ["--no-w-reset", "--no-narrow-w", "--decoder-sees-h"]])
+def test_other_models_run(tmp_path, flags):
+    run(*SMALL, *flags, "--stop-at", 1000, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["updates"] == 25
+
+
+def test_copied_alone(small_run, tmp_path):
+    (tmp_path / "mine.py").write_text(SCRIPT.read_text())
+    run(*SMALL, "--run-dir", "run", cwd=tmp_path, script=tmp_path / "mine.py", PYTHONSAFEPATH="1")
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+
+
+@needs_compiler
+def test_compiled_and_plain_agree():
+    """The same batch, the same draws: parts of the losses."""
+    data, results = make_data([[1, 0, 0, 0, 0, 0]] * 3), []
+    for compiles in (False, True):
+        torch.manual_seed(0)
+        learner = method.Learner(make_args(), method.HWM(make_args(), 3), CPU)
+        assert not compiles or method.compile_steps(learner, data)
+        torch.manual_seed(7)
+        parts = [learner.update(data) for _ in range(3)]
+        results.append({name: value.item() for name, value in parts[-1].items()})
+    for name, value in results[0].items():
+        assert results[1][name] == pytest.approx(value, rel=1e-3, abs=1e-4), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_killed_runs_end_with_the_same_bytes(tmp_path, seed):
+    flags = [*SMALL, "--total-timesteps", 5_000, "--seed", seed]
+    run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 14, seed, SCRIPT)
+    run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(tmp_path / "whole", tmp_path / "run")
