@@ -896,12 +896,19 @@ class Behaviour(nn.Module):
 
     STEPS = ("policy",)
 
-    def __init__(self, args: Args, feature_size: int, num_actions: int):
+    def __init__(self, args: Args, model: nn.Module):
         super().__init__()
-        heads = args.head_size, args.head_layers, args.head_norm
-        self.actor = head(feature_size, heads[0], num_actions, *heads[1:])
-        self.critic = head(feature_size, heads[0], 1, *heads[1:])
+        shape = args.head_layers, args.head_norm
+        self.actor = head(model.feature_size, args.head_size, model.num_actions, *shape)
+        self.critic = head(model.feature_size, args.head_size, 1, *shape)
         self.slow_critic = copy.deepcopy(self.critic).requires_grad_(False)
+
+    def parts(self) -> dict[str, nn.Module]:
+        """What learns, each by its own loss."""
+        return {"actor": self.actor, "critic": self.critic}
+
+    def copy_critics(self) -> None:
+        self.slow_critic.load_state_dict(self.critic.state_dict())
 
     def policy(self, features: torch.Tensor) -> torch.Tensor:
         """Logits of the actions, (..., A)."""
@@ -955,8 +962,8 @@ def dream_weights(discounts: torch.Tensor) -> torch.Tensor:
 
 def behaviour_loss(
     behaviour: Behaviour, dream: Dream, gae_lambda: float, ent_coef: float
-) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
-    """The losses of the actor (Eq. 3.3.9) and of the critic (Eq. 3.3.8), and what to log.
+) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """The losses of the actor (Eq. 3.3.9) and of the critic (Eq. 3.3.8) by their names, and what to log.
 
     Eq. 3.3.9 with the return less the slow critic in the place of V.
     """
@@ -969,9 +976,10 @@ def behaviour_loss(
     logprobs = (log_policy * dream.actions).sum(-1)
     actor_loss = -(weights * (logprobs * advantages + ent_coef * entropy)).mean()  # Eq. 3.3.9
     critic_loss = (weights * 0.5 * (behaviour.value(dream.features[:-1]) - returns).square()).mean()  # Eq. 3.3.8
-    parts = {"actor": actor_loss, "critic": critic_loss, "entropy": entropy.mean(), "advantage_std": advantages.std()}
+    losses = {"actor": actor_loss, "critic": critic_loss}
+    parts = {**losses, "entropy": entropy.mean(), "advantage_std": advantages.std()}
     parts |= {"dream_return": returns.mean(), "dream_reward": dream.rewards.max()}
-    return actor_loss, critic_loss, {f"losses/{name}": value.detach() for name, value in parts.items()}
+    return losses, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
 
 class Learner:
@@ -980,23 +988,19 @@ class Learner:
     def __init__(self, args: Args, model: nn.Module, device: torch.device):
         self.args, self.device, self.updates = args, device, 0
         self.model = model.to(device)
-        self.behaviour = Behaviour(args, model.feature_size, model.num_actions).to(device)
+        self.behaviour = Behaviour(args, model).to(device)
+        self.modules = {"model": self.model, **self.behaviour.parts()}
+        self.optimizers = {name: self.make_optimizer(name) for name in self.modules}
+
+    def make_optimizer(self, name: str) -> torch.optim.AdamW:
+        args = self.args
+        settings = {"weight_decay": args.weight_decay, "fused": True, "eps": 1e-5 if name == "model" else args.adam_eps}
         rates = {
             "model": args.model_learning_rate,
             "actor": args.actor_learning_rate,
             "critic": args.critic_learning_rate,
         }
-        self.modules = {"model": self.model, "actor": self.behaviour.actor, "critic": self.behaviour.critic}
-        self.optimizers = {
-            name: torch.optim.AdamW(
-                self.modules[name].parameters(),
-                rate,
-                eps=1e-5 if name == "model" else args.adam_eps,
-                weight_decay=args.weight_decay,
-                fused=True,
-            )
-            for name, rate in rates.items()
-        }
+        return torch.optim.AdamW(self.modules[name].parameters(), rates[name.split("_")[-1]], **settings)
 
     def descend(self, **losses: torch.Tensor) -> None:
         """One step of Adam for each named loss."""
@@ -1028,11 +1032,11 @@ class Learner:
         args = self.args
         with self.arithmetic():
             dream = imagine(self.model, self.behaviour, begins, args.horizon, args.gamma)
-            actor_loss, critic_loss, parts = behaviour_loss(self.behaviour, dream, args.gae_lambda, args.ent_coef)
-        self.descend(actor=actor_loss, critic=critic_loss)
+            losses, parts = behaviour_loss(self.behaviour, dream, args.gae_lambda, args.ent_coef)
+        self.descend(**losses)
         self.updates += 1
         if self.updates % args.slow_interval == 0:
-            self.behaviour.slow_critic.load_state_dict(self.behaviour.critic.state_dict())
+            self.behaviour.copy_critics()
         return parts
 
     def draw_starts(self, states: NamedTuple, terminals: torch.Tensor) -> NamedTuple:
@@ -1070,7 +1074,7 @@ def compile_steps(learner: Learner, data: Chunks) -> bool:
         with learner.arithmetic():
             loss, states, _ = world_model_loss(model, data, 0)
             dream = imagine(model, behaviour, learner.draw_starts(states, data.terminals), 2, 1.0)
-            (loss + behaviour_loss(behaviour, dream, 1.0, 0.0)[0]).backward()
+            sum(behaviour_loss(behaviour, dream, 1.0, 0.0)[0].values(), loss).backward()
     except Exception as error:  # whatever the compiler's tool chain lacks, the plain steps need none of it
         print(f"--compile: failed ({first_line(error)}), goes on without", file=sys.stderr)
         for owner, name, step in plain:

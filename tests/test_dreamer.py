@@ -295,12 +295,11 @@ def chain_starts() -> ChainState:
 def test_actions_are_scored_at_the_states_where_they_are_taken():
     """Log-probabilities of action h at features h, the return of h + 1 on: one update raises what leads to the goal."""
     torch.manual_seed(0)
-    behaviour = method.Behaviour(make_args(), 5, 2)
+    behaviour = method.Behaviour(make_args(), Chain())
     actions = F.one_hot(torch.tensor([[1], [1]]), 2).float()
     features = torch.eye(5)[[2, 3, 4]][:, None]
     dream = method.Dream(features, actions, torch.tensor([[0.0], [1.0]]), torch.tensor([[0.9], [0.0]]))
-    loss, _, _ = method.behaviour_loss(behaviour, dream, 1.0, 0.0)
-    loss.backward()
+    loss = method.behaviour_loss(behaviour, dream, 1.0, 0.0)[0]["actor"]
     log_policy = behaviour.actor(features[:-1]).log_softmax(-1)[..., 1]  # advantages 0.9 and 1, weights 1 and 0.9
     expected = -(log_policy[0] * 0.9 + 0.9 * log_policy[1] * 1.0).sum() / 2
     assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
