@@ -174,6 +174,8 @@ class Args:
     """price of a read, on the mean read rate"""
     budget: float = 0.23
     """share of steps read without a price, from 1 over 80% of the updates"""
+    budget_start: float = 1.0
+    """that share at first"""
     budget_price: float = 50.0
     """price of the reads beyond it, on the mean read rate; 0: no budget"""
 
@@ -228,7 +230,7 @@ def complete_args(args: Args) -> Args:
         ("max_grad_norm", lambda x: x > 0, "must be greater than 0"),
         (scales, lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
         ("read_bias std_bias", math.isfinite, "must be finite"),
-        ("kl_balance budget", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
+        ("kl_balance budget budget_start", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("temperature", lambda x: 0 < x <= 1, "must be greater than 0 and at most 1"),
         ("max_segment_length max_segments", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
@@ -747,7 +749,7 @@ def schedule(args: Args, update: int) -> tuple[float, float, float]:
     done = update / args.total_updates
     ramp = min(1.0, done / 0.8)
     rate = args.learning_rate * min(1.0, (update + 1) / 100) * (1.0 if done < 0.7 else 0.3)
-    return rate, 1 + (args.temperature - 1) * ramp, 1 + (args.budget - 1) * ramp
+    return rate, 1 + (args.temperature - 1) * ramp, args.budget_start + (args.budget - args.budget_start) * ramp
 
 
 def train_step(model: HWM, optimizer: torch.optim.Adam, data: Sequence, update: int) -> dict[str, torch.Tensor]:

@@ -12,8 +12,8 @@ METHODS = sorted(
 PPO, DQN, DISTILL = "ppo_continuous_kle.py", "dqn_apple.py", "distill_hybrid.py"
 DDPG, GAIL = "ddpg_torcs_like.py", "gail_hybrid.py"
 ROOMS, HWM = "ppo_fourrooms.py", "hwm_segment.py"
-DREAMER, HWM_DREAMER = "dreamer_v2.py", "hwm_dreamer.py"
-DREAMERS = {  # of both
+DREAMER, HWM_DREAMER, HRL = "dreamer_v2.py", "hwm_dreamer.py", "hwm_hrl_dreamer.py"
+DREAMERS = {  # of all three
     "Collector": "plays with the world model, into the replay",
     "Player": "holds what the world model believes",
     "make_env": "the side of the frames",
@@ -25,6 +25,14 @@ DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's 
     "make_games": "the driving task with its options",
     "play": "games that are made by the caller, continuous actions",
     "record_video": "continuous actions",
+}
+HWM_AGENTS = {
+    "SIZES": "sizes of the HWM",
+    "world_model_loss": "J_HWM",
+    "Belief": "counts the steps of a segment",
+    "HWM": "filters and dreams, by the actions before the frames; heads for reward and discount",
+    "mlp": "ELU, torch's own initialisation",
+    "schedule": "of updates that go on as long as the agent plays",
 }
 DIFFERS: dict[tuple[str, str], str] = {
     ("CompiledUpdate", DQN): "has a target network, and a minibatch of transitions",
@@ -76,13 +84,11 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("read_demonstrations", HWM): "any environment with rooms",
     ("read_episode", HWM): "images, states and rooms",
     ("split_episodes", HWM): "by pairs",
-    **{(name, file): reason for name, reason in DREAMERS.items() for file in (DREAMER, HWM_DREAMER)},
-    ("SIZES", HWM_DREAMER): "sizes of the HWM",
-    ("world_model_loss", HWM_DREAMER): "J_HWM",
-    ("Belief", HWM_DREAMER): "counts the steps of a segment",
-    ("HWM", HWM_DREAMER): "filters and dreams, by the actions before the frames; heads for reward and discount",
-    ("mlp", HWM_DREAMER): "ELU, torch's own initialisation",
-    ("schedule", HWM_DREAMER): "of updates that go on as long as the agent plays",
+    **{(name, file): reason for name, reason in DREAMERS.items() for file in (DREAMER, HWM_DREAMER, HRL)},
+    **{(name, file): reason for name, reason in HWM_AGENTS.items() for file in (HWM_DREAMER, HRL)},
+    **{(name, HRL): "two levels" for name in ("Behaviour", "Dream", "imagine", "behaviour_loss")},
+    ("Collector", HRL): "keeps the skills that are played",
+    ("Player", HRL): "holds what the world model believes, and the skill",
 }
 OWN = {  # each method's own by design
     *("Args", "Agent", "complete_args", "main", "evaluate", "finish_run", "plot_learning_curve", "print_table"),

@@ -1,0 +1,256 @@
+"""HWM HRL Dreamer: both levels of its behaviour against independent sources, and small runs. The rest is tested in its twins."""
+
+import csv
+import json
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from conftest import ROOT, kill_twice, needs_compiler, run
+from test_dreamer import assert_same_states
+from test_hwm_dreamer import SMALL, TINY, make_data
+
+from cleanrl_thesis import hwm_hrl_dreamer as method
+
+SCRIPT = ROOT / "cleanrl_thesis" / "hwm_hrl_dreamer.py"
+CPU = torch.device("cpu")
+
+
+def make_args(**changes) -> method.Args:
+    return method.complete_args(method.Args(**{**TINY, "prefill": 500, "total_timesteps": 1000, **changes}))
+
+
+def brute_force_high(rewards, discounts, decides, high_values, last_value, gae_lambda: float, h: int) -> float:
+    """Eq. 3.3.16's λ-return from step h, segment by segment.
+
+    A segment's reward is the discounted sum of its steps'; the λ-return over n segments mixes what 1, 2, ... segments and the
+    value behind them are worth, and the segment that the dream does not finish is worth the value of its level.
+    """
+    ends = [k for k in range(h + 1, len(decides)) if decides[k]]  # states at which the following segments begin
+    horizon = len(rewards)
+
+    def discounted(begin: int, end: int) -> tuple[float, float]:
+        total, weight = 0.0, 1.0
+        for k in range(begin, end):
+            total += weight * rewards[k]
+            weight *= discounts[k]
+        return total, weight
+
+    total, weight = discounted(h, horizon)
+    longest = total + weight * (high_values[horizon] if decides[horizon] else last_value)
+    sums = [(end, *discounted(h, end)) for end in ends if end < horizon]
+    shorter = [reward + weight * high_values[end] for end, reward, weight in sums]
+    value, share = 0.0, 1.0
+    for each in shorter:
+        value += share * (1 - gae_lambda) * each
+        share *= gae_lambda
+    return value + share * longest
+
+
+@pytest.mark.parametrize("boundary", [None, *range(1, 7)])
+@pytest.mark.parametrize("terminal", [None, 0, 3, 5])
+def test_high_return_by_brute_force(boundary, terminal):
+    """With a boundary at each place, one at the horizon, none, several; and an end of the episode within the dream."""
+    rng = np.random.default_rng(0)
+    rewards, discounts = rng.normal(size=(6, 3)), 0.97 * rng.random((6, 3))
+    high_values, last_value = rng.normal(size=(7, 3)), rng.normal(size=3)
+    decides = np.zeros((7, 3))
+    decides[0] = 1
+    if boundary is not None:
+        decides[boundary] = 1
+    decides[[2, 4], 1] = 1
+    decides[1:, 2] = 1
+    if terminal is not None:
+        discounts[terminal] = 0
+    tensors = [torch.from_numpy(array) for array in (rewards, discounts, decides, high_values, last_value)]
+    returns = method.high_return(*tensors, 0.9).numpy()
+    for n in range(3):
+        for h in range(6):
+            columns = rewards[:, n], discounts[:, n], decides[:, n], high_values[:, n], last_value[n]
+            assert returns[h, n] == pytest.approx(brute_force_high(*columns, 0.9, h)), (h, n)
+    if terminal is not None:
+        assert returns[terminal] == pytest.approx(rewards[terminal])
+
+
+def test_high_return_is_the_low_one_where_each_step_is_a_segment():
+    torch.manual_seed(0)
+    rewards, discounts, values = torch.randn(5, 2), torch.rand(5, 2), torch.randn(6, 2)
+    both = method.high_return(rewards, discounts, torch.ones(6, 2), values, torch.zeros(2), 0.8)
+    assert torch.allclose(both, method.lambda_return(rewards, discounts, values, 0.8), atol=1e-6)
+
+
+class CorridorState(NamedTuple):
+    place: torch.Tensor  # (N, 9) one-hot
+    room: torch.Tensor  # (N, 3) one-hot
+    age: torch.Tensor  # (N, 1): 0 where a room was entered
+
+    def features(self) -> torch.Tensor:
+        """z is the room, w the place."""
+        return torch.cat([self.room, self.place], -1)
+
+
+class Corridor(torch.nn.Module):
+    """Places 0 to 8 in three rooms of three; action 1 leads up, 0 down; to arrive at 8 pays 1 and ends the episode."""
+
+    feature_size, num_actions = 12, 2
+
+    def __init__(self):
+        super().__init__()
+        self.unused = torch.nn.Parameter(torch.zeros(1))
+
+    def noise(self, *shape):
+        return torch.zeros(*shape, 1)
+
+    def imagine_step(self, state, action, noise):
+        place = (state.place.argmax(-1) + 2 * action.argmax(-1) - 1).clamp(0, 8)
+        room = place // 3
+        age = (state.age + 1) * (room == state.room.argmax(-1))[:, None]
+        return CorridorState(F.one_hot(place, 9).float(), F.one_hot(room, 3).float(), age)
+
+    def outcome(self, features):
+        return features[..., 11], 1 - features[..., 11]
+
+
+def corridor_starts() -> CorridorState:
+    place = torch.arange(8).repeat(4)
+    return CorridorState(F.one_hot(place, 9).float(), F.one_hot(place // 3, 3).float(), torch.zeros(32, 1))
+
+
+def make_learner(**changes) -> method.Learner:
+    args = make_args(deter_z=2, stoch_z=1, **changes)
+    torch.manual_seed(0)
+    return method.Learner(args, Corridor(), CPU)
+
+
+def test_skills_are_kept_in_a_segment_and_redrawn_at_its_end():
+    learner = make_learner(num_skills=4)
+    dream = method.imagine(learner.model, learner.behaviour, corridor_starts(), 30, 0.9)
+    rooms = dream.features[..., :3].argmax(-1)
+    assert torch.equal(dream.decides[1:] > 0, rooms[1:] != rooms[:-1]) and (dream.decides[0] == 1).all()
+    changed = (dream.skills[1:] != dream.skills[:-1]).any(-1)
+    assert not (changed & (dream.decides[1:] == 0)).any()
+    kept = 1 - changed[dream.decides[1:] > 0].float().mean()
+    assert kept.item() == pytest.approx(0.25, abs=0.1)  # four skills, as likely as each other at first
+
+
+def test_both_levels_learn_a_corridor():
+    """The low level's values are γ^(7 − place); the high level's lie between those of a room's first and last place."""
+    learner = make_learner(gamma=0.9, horizon=10, head_size=32, slow_interval=20, ent_coef=1e-3, num_skills=3)
+    for _ in range(2_000):
+        parts = learner.learn_behaviour(corridor_starts())
+    state = CorridorState(torch.eye(9)[:8], F.one_hot(torch.arange(8) // 3, 3).float(), torch.zeros(8, 1))
+    with torch.no_grad():
+        skill = F.one_hot(learner.behaviour.high_policy(state.features()).argmax(-1), 3).float()
+        values = learner.behaviour.value(state.features(), skill)
+        policy = learner.behaviour.policy(state.features(), skill).softmax(-1)[:, 1]
+        high = learner.behaviour.high_value(state.features())
+    expected = 0.9 ** torch.arange(7.0, -1, -1)
+    assert torch.allclose(values, expected, atol=0.06), values
+    assert (policy > 0.9).all(), policy
+    assert (high[[0, 3, 6]] > expected[[0, 3, 6]] - 0.05).all() and (high[[0, 3, 6]] < expected[[2, 5, 7]] + 0.05).all()
+    assert -1e-6 < parts["losses/skill_information"] < np.log(2)
+    assert -1e-6 < parts["losses/skill_usage_entropy"] <= np.log(3) + 1e-5
+
+
+def test_losses_of_the_high_level_count_decisions_only():
+    """Eq. 3.3.16 and 3.3.17 by a loop over the decisions, weighed by how likely the dream comes to them."""
+    learner = make_learner(num_skills=3)
+    torch.manual_seed(3)
+    for parameter in learner.behaviour.parameters():
+        torch.nn.init.normal_(parameter, std=0.4)
+    behaviour = learner.behaviour
+    dream = method.imagine(learner.model, behaviour, corridor_starts(), 6, 0.9)
+    losses, _ = method.behaviour_loss(behaviour, dream, 0.8, 0.01)
+    with torch.no_grad():
+        values, high = behaviour.slow_value(dream.features, dream.skills), behaviour.slow_high_value(dream.features)
+        returns = method.high_return(dream.rewards, dream.discounts, dream.decides, high, values[-1], 0.8)
+        actor = critic = number = 0.0
+        for n in range(32):
+            weight = 1.0
+            for h in range(6):
+                if dream.decides[h, n]:
+                    number += 1
+                    log_policy = behaviour.high_policy(dream.features[h, n]).log_softmax(-1)
+                    entropy = -(log_policy.exp() * log_policy).sum()
+                    chosen = log_policy[dream.skills[h, n].argmax()]
+                    actor -= weight * (chosen * (returns[h, n] - high[h, n]) + 0.01 * entropy)
+                    critic += weight * 0.5 * (behaviour.high_value(dream.features[h, n]) - returns[h, n]) ** 2
+                weight *= dream.discounts[h, n]
+    assert losses["high_actor"].item() == pytest.approx(float(actor / number), rel=1e-4)
+    assert losses["high_critic"].item() == pytest.approx(float(critic / number), rel=1e-4)
+
+
+def test_information_of_the_skill():
+    """ln 2 where each of two skills, as likely as the other, has an action of its own; 0 where the skill is not seen."""
+    learner = make_learner(num_skills=2, head_layers=1)
+    behaviour, features = learner.behaviour, corridor_starts().features()
+    assert method.skill_information(behaviour, features).item() == pytest.approx(0, abs=1e-6)
+    behaviour.policy = lambda features, skill: 40 * skill
+    assert method.skill_information(behaviour, features).item() == pytest.approx(np.log(2), abs=1e-4)
+
+
+def test_the_player_keeps_its_skill_until_z_is_read(tmp_path):
+    args = make_args(num_skills=4, fixed_interval=5)
+    torch.manual_seed(0)
+    learner = method.Learner(args, method.HWM(args, 3), CPU)
+    player, skills = method.Player(learner, 6), []
+    frames = np.zeros((6, 22, 22, 3), np.uint8)
+    for t in range(15):
+        player.observe(frames, np.full(6, t == 0))
+        player.act()
+        skills.append(player.skill)
+    for t in range(1, 15):
+        assert torch.equal(skills[t], skills[t - 1]) == (t % 5 != 0), t
+
+
+# Runs
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hrl")
+    run(*SMALL, "--run-dir", "run", "--save-model", cwd=folder, script=SCRIPT)
+    return folder / "run"
+
+
+def test_small_run_leaves_its_records(small_run):
+    rows = list(csv.DictReader((small_run / "updates.csv").read_text().splitlines()))
+    assert [row["global_step"] for row in rows] == ["1000", "1500"]
+    assert float(rows[0]["losses/skill_usage_entropy"]) > 1 and "losses/skill_information" in rows[0]
+    assert json.loads((small_run / "result.json").read_text())["updates"] == 50
+
+
+def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path):
+    for stop_at in (500, 1000, 1500):
+        run(*SMALL, "--run-dir", "run", "--resume", "--stop-at", stop_at, cwd=tmp_path, script=SCRIPT)
+    assert_same_states(small_run, tmp_path / "run")
+
+
+def test_copied_alone(small_run, tmp_path):
+    (tmp_path / "mine.py").write_text(SCRIPT.read_text())
+    run(*SMALL, "--run-dir", "run", cwd=tmp_path, script=tmp_path / "mine.py", PYTHONSAFEPATH="1")
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+
+
+@needs_compiler
+def test_compiled_and_plain_agree():
+    """The same batch, the same draws: parts of the losses."""
+    data, results = make_data([[1, 0, 0, 0, 0, 0]] * 3), []
+    for compiles in (False, True):
+        torch.manual_seed(0)
+        learner = method.Learner(make_args(), method.HWM(make_args(), 3), CPU)
+        assert not compiles or method.compile_steps(learner, data)
+        torch.manual_seed(7)
+        parts = [learner.update(data) for _ in range(3)]
+        results.append({name: value.item() for name, value in parts[-1].items()})
+    for name, value in results[0].items():
+        assert results[1][name] == pytest.approx(value, rel=1e-3, abs=1e-4), name
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_with_the_same_bytes(tmp_path):
+    flags = [*SMALL, "--total-timesteps", 5_000]
+    run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 14, 0, SCRIPT)
+    run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(tmp_path / "whole", tmp_path / "run")
