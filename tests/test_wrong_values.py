@@ -8,6 +8,7 @@ from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_apple as dqn
 from cleanrl_thesis import dreamer_v2 as dreamer
 from cleanrl_thesis import gail_hybrid as gail
+from cleanrl_thesis import hwm_dreamer, hwm_hrl_dreamer
 from cleanrl_thesis import hwm_segment as hwm
 from cleanrl_thesis import ppo_fourrooms as rooms
 
@@ -106,15 +107,21 @@ BAD_DREAMER = [
     (["--gamma", "nan"], ["--gamma", "nan"]),
     (["--resume"], ["--resume", "--run-dir"]),
 ]
-BAD = {
-    dqn: BAD_DQN,
-    distill: BAD_DISTILL,
-    ddpg: BAD_DDPG,
-    gail: BAD_GAIL,
-    rooms: BAD_ROOMS,
-    hwm: BAD_HWM,
-    dreamer: BAD_DREAMER,
-}
+BAD_HWM_DREAMER = [
+    (["--size", "huge"], ["--size", "huge", "thesis"]),
+    (["--encoder", "cnn"], ["--frame-side", "22", "64", "--encoder cnn"]),
+    (["--num-envs", 7], ["--num-envs", "7", "divide 500"]),
+    (["--stoch-w", 0], ["--stoch-w", "0"]),
+    (["--budget", 1.5], ["--budget", "1.5", "between 0 and 1"]),
+    (["--temperature", 0], ["--temperature", "0.0"]),
+    (["--fixed-interval", "-1"], ["--fixed-interval", "-1"]),
+    (["--budget-updates", 0], ["--budget-updates", "0"]),
+    (["--kl-z-scale", "nan"], ["--kl-z-scale", "nan"]),
+    (["--resume"], ["--resume", "--run-dir"]),
+]
+BAD_HRL = [*BAD_HWM_DREAMER, (["--num-skills", 1], ["--num-skills", "1", "at least 2"])]
+BAD = {dqn: BAD_DQN, distill: BAD_DISTILL, ddpg: BAD_DDPG, gail: BAD_GAIL, rooms: BAD_ROOMS, hwm: BAD_HWM}
+BAD |= {dreamer: BAD_DREAMER, hwm_dreamer: BAD_HWM_DREAMER, hwm_hrl_dreamer: BAD_HRL}
 
 
 @pytest.mark.parametrize(
