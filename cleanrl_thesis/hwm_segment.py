@@ -99,7 +99,7 @@ class Args:
     checkpoint_interval: int = 200
     """updates between checkpoints"""
     stop_at: int | None = None
-    """end at this update of the full schedule; `--resume` can finish the run later"""
+    """end at this update of all attempts together; `--resume` can finish the run later"""
 
     # Data
     demos: Path | None = None
@@ -114,8 +114,10 @@ class Args:
     """factor on the red channel: the agent is small, and would be found late"""
 
     # Algorithm
+    attempts: int = 4
+    """models trained one after the other, each from weights of its own; that with the greatest J_HWM is kept"""
     total_updates: int = 3_000
-    """gradient steps"""
+    """gradient steps of an attempt"""
     batch_size: int = 16
     """chunks per batch"""
     chunk_length: int = 32
@@ -218,8 +220,8 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
-    args.stop_at = args.total_updates if args.stop_at is None else args.stop_at
-    counts = "num_threads checkpoint_interval stop_at train_pairs heldout_episodes total_updates batch_size hidden_size"
+    args.stop_at = args.attempts * args.total_updates if args.stop_at is None else args.stop_at
+    counts = "num_threads checkpoint_interval attempts stop_at train_pairs heldout_episodes total_updates batch_size hidden_size"
     counts += " deter_z stoch_z deter_w stoch_w"
     scales = "kl_z_scale kl_w_scale kl_m_scale read_price budget_price boundary_bound"
     for names, holds, allowed in (
@@ -746,7 +748,7 @@ LOG_INTERVAL = 50  # updates between rows of updates.csv
 
 def schedule(args: Args, update: int) -> tuple[float, float, float]:
     """Learning rate, temperature and read budget of an update, counted from 0."""
-    done = update / args.total_updates
+    update, done = update % args.total_updates, update % args.total_updates / args.total_updates
     ramp = min(1.0, done / 0.8)
     rate = args.learning_rate * min(1.0, (update + 1) / 100) * (1.0 if done < 0.7 else 0.3)
     return rate, 1 + (args.temperature - 1) * ramp, args.budget_start + (args.budget - args.budget_start) * ramp
@@ -765,6 +767,23 @@ def train_step(model: HWM, optimizer: torch.optim.Adam, data: Sequence, update: 
     nn.utils.clip_grad_norm_(model.parameters(), args.max_grad_norm)
     optimizer.step()
     return {"loss": loss.detach(), **terms}
+
+
+@torch.no_grad()
+def objective(model: HWM, data: Sequence) -> float:
+    """J_HWM (Eq. 3.3.5, every weight 1) per step of the training data, with m, z and w drawn from q."""
+    args, state = model.args, torch.get_rng_state()
+    torch.manual_seed(args.seed)
+    starts = torch.arange(0, len(data.actions) - args.chunk_length + 1, args.chunk_length)
+    _, terms = hwm_loss(model, data.chunks(starts.to(data.actions.device), args.chunk_length), args.temperature, 1.0)
+    torch.set_rng_state(state)
+    return -sum(terms[name].item() for name in ("reconstruction", "kl_z", "kl_w", "kl_m"))
+
+
+def new_model(args: Args, data: Sequence, num_actions: int) -> tuple[HWM, torch.optim.Adam]:
+    """A model with weights of its own, on the data's device, and its optimiser."""
+    model = HWM(args, data.frames.shape[1], num_actions).to(data.frames.device)
+    return model, torch.optim.Adam(model.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
 
 
 def compile_step(model: HWM, data: Sequence, args: Args) -> bool:
@@ -984,6 +1003,12 @@ def segment(model: HWM, episodes: list[Episode], normalizer: Normalizer, mode: s
     )
 
 
+def held_out_scores(model: HWM, episodes: list[Episode], normalizer: Normalizer, device) -> dict[str, float]:
+    """How good the boundaries of p(m) are, for the record: no attempt is chosen by it."""
+    scores = boundary_scores(segment(model, episodes, normalizer, "prior", device).found, [e.rooms for e in episodes])
+    return {name: scores[name] for name in ("f1_4_rooms_0", "f1_4_rooms_1", "read_rate", "door_entry_recall")}
+
+
 def probes(train: Segmented, test: Segmented, train_episodes: list[Episode], test_episodes: list[Episode]) -> dict:
     """What a linear probe reads from z and from w, and how well the most frequent label does."""
     labels = []
@@ -1112,7 +1137,7 @@ def main(args: Args) -> int:
     data = in_a_row(episodes[0], normalizer)
     data_id, num_actions = fingerprint(data), int(data.actions.max()) + 1
     run_dir, checkpoint = open_run_dir(args)
-    last_update = min(args.total_updates, args.stop_at)
+    last_update = min(args.attempts * args.total_updates, args.stop_at)
     same_data = checkpoint is None or checkpoint["data"] == data_id
     require(same_data, "--resume", run_dir, "the demonstrations are no longer those that the run began with")
     if is_done(run_dir, args, last_update):
@@ -1133,11 +1158,11 @@ def main(args: Args) -> int:
     stop = StopSignal()
 
     data = Sequence(*(column.to(device) for column in data))
-    model = HWM(args, data.frames.shape[1], num_actions).to(device)
-    optimizer = torch.optim.Adam(model.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
-    update, training_seconds, offset = 0, 0.0, 0
+    model, optimizer = new_model(args, data, num_actions)
+    update, training_seconds, offset, attempts, best = 0, 0.0, 0, [], None
     if checkpoint is not None:
         update, training_seconds, offset = checkpoint["update"], checkpoint["training_seconds"], checkpoint["offset"]
+        attempts, best = checkpoint["attempts"], checkpoint["best"]
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
     is_compiled = args.compile and update < last_update and compile_step(model, data, args)
@@ -1155,16 +1180,27 @@ def main(args: Args) -> int:
     last_time = time.perf_counter()
 
     while update < last_update:
+        if update and update % args.total_updates == 0:  # the next attempt
+            model, optimizer = new_model(args, data, num_actions)
+            if is_compiled:
+                compile_step(model, data, args)
         terms = train_step(model, optimizer, data, update)
         update += 1
         progress.update(1)
+        if update % args.total_updates == 0:
+            attempts.append(
+                {"objective": objective(model, data), **held_out_scores(model, episodes[1], normalizer, device)}
+            )
+            if best is None or attempts[-1]["objective"] > max(each["objective"] for each in attempts[:-1]):
+                best = {name: value.clone() for name, value in model.state_dict().items()}
         crossed = update % args.checkpoint_interval == 0
-        if not (update % LOG_INTERVAL == 0 or crossed or stop.received or update == last_update):
+        ends = update % args.total_updates == 0 or update == last_update
+        if not (update % LOG_INTERVAL == 0 or crossed or stop.received or ends):
             continue
         now = time.perf_counter()
         training_seconds, last_time = training_seconds + now - last_time, now
         metrics = {f"losses/{name}": value.item() for name, value in terms.items()}
-        if update % LOG_INTERVAL == 0 or update == args.total_updates:
+        if update % LOG_INTERVAL == 0 or update % args.total_updates == 0:
             updates_csv.write({"global_step": update, **metrics})
             add_scalars(writer, {**metrics, "charts/updates_per_second": update / training_seconds}, update)
         if not math.isfinite(metrics["losses/loss"]):
@@ -1177,6 +1213,8 @@ def main(args: Args) -> int:
                 "update": update,
                 "training_seconds": training_seconds,
                 "offset": updates_csv.sync(),
+                "attempts": attempts,
+                "best": best,
                 "model": model.state_dict(),
                 "optimizer": optimizer.state_dict(),
                 "torch_rng": torch.get_rng_state(),
@@ -1191,16 +1229,25 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    finish_run(model, episodes, normalizer, args, run_dir, update, training_seconds, device)
+    model.load_state_dict(best or model.state_dict())
+    finish_run(model, attempts, episodes, normalizer, args, run_dir, update, training_seconds, device)
     writer.close()
     return 0
 
 
 def finish_run(
-    model: HWM, episodes, normalizer: Normalizer, args: Args, run_dir: Path, update: int, seconds: float, device
+    model: HWM,
+    attempts: list,
+    episodes,
+    normalizer: Normalizer,
+    args: Args,
+    run_dir: Path,
+    update: int,
+    seconds,
+    device,
 ) -> None:
     """Measure, draw Fig. 3.4, save what was asked for, and write `result.json` last."""
-    segmentation = evaluate(model, episodes, normalizer, args, device)
+    segmentation = {**evaluate(model, episodes, normalizer, args, device), "attempts": attempts}
     write_json(run_dir / "segmentation.json", segmentation)
     draw_figure(model, longest_way(episodes[1]), normalizer, device, run_dir / "figure_3_4.png")
     if args.save_model:
@@ -1211,7 +1258,7 @@ def finish_run(
         "env_id": args.env_id,
         "seed": args.seed,
         "global_step": update,
-        "complete": update == args.total_updates,
+        "complete": update == args.attempts * args.total_updates,
         "finish": {name: arguments(args)[name] for name in FINISH},
         "training_seconds": seconds,
         "updates_per_second": update / seconds,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT, flip_a_byte, kill_twice, needs_compiler, rewrite, run
+from safetensors.torch import load_file
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import mannwhitneyu
 
@@ -26,7 +27,20 @@ FAITHFUL = {  # rung (a) of benchmark/hwm_segment.sh
 }
 SIZES = {"deter_z": 5, "stoch_z": 3, "deter_w": 6, "stoch_w": 2, "hidden_size": 16}
 SMALL = [
-    *("--train-pairs", 300, "--total-updates", 12, "--checkpoint-interval", 2, "--batch-size", 4, "--chunk-length", 8),
+    *(
+        "--train-pairs",
+        300,
+        "--attempts",
+        2,
+        "--total-updates",
+        6,
+        "--checkpoint-interval",
+        2,
+        "--batch-size",
+        4,
+        "--chunk-length",
+        8,
+    ),
     *(word for name, value in SIZES.items() for word in (f"--{name.replace('_', '-')}", value)),
 ]
 
@@ -395,19 +409,48 @@ def assert_same_states(left, right) -> None:
             assert torch.equal(value, states[1]["optimizer"]["state"][number][key]), (number, key)
 
 
-def test_a_stopped_run_goes_on_to_the_same_bytes(demos, small_run, tmp_path):
+@pytest.mark.parametrize("stop_at", [5, 6, 9])
+def test_a_stopped_run_goes_on_to_the_same_bytes(demos, small_run, tmp_path, stop_at):
+    """Within the first attempt, at its end, and within the second."""
     flags = [*SMALL, "--demos", demos, "--run-dir", "run", "--resume"]
-    run(*flags, "--stop-at", 5, cwd=tmp_path, script=SCRIPT)
+    run(*flags, "--stop-at", stop_at, cwd=tmp_path, script=SCRIPT)
     path = tmp_path / "run" / "checkpoint.pt"
     path.write_bytes(path.read_bytes()[:1000])  # torn: the one before it is taken
     run(*flags, cwd=tmp_path, script=SCRIPT)
     assert_same_states(small_run, tmp_path / "run")
 
 
+def test_the_attempt_with_the_greatest_objective_is_kept(demos, small_run):
+    """Each has other weights; the kept one's J_HWM is the greatest, computed again from what was saved."""
+    attempts = json.loads((small_run / "segmentation.json").read_text())["attempts"]
+    values = [each["objective"] for each in attempts]
+    assert len(values) == 2 and values[0] != values[1]
+    args = method.parse_args([*map(str, SMALL), "--demos", str(demos)])
+    args = method.complete_args(args)
+    episodes = method.split_episodes(method.read_demonstrations(demos, args.frame_side)[0], args)
+    mean = np.concatenate([episode.frames for episode in episodes[0]]).mean(0) / 255
+    data = method.in_a_row(episodes[0], method.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32)))
+    model = method.HWM(args, data.frames.shape[1], int(data.actions.max()) + 1)
+    model.load_state_dict(load_file(small_run / "model.safetensors"))
+    assert method.objective(model, data) == pytest.approx(max(values), rel=1e-5)
+
+
+def test_objective_is_eq_3_3_5_with_every_weight_1():
+    model, data = make_model(**FAITHFUL, image_scale=2.0, chunk_length=9), make_data([[5, 4], [9]])
+    flat = method.Sequence(*(column.transpose(0, 1).flatten(0, 1) for column in data))
+    state = torch.get_rng_state()
+    value = method.objective(model, flat)
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.manual_seed(model.args.seed)
+    _, terms = method.hwm_loss(model, data, model.args.temperature, 1.0)
+    names = ("reconstruction", "kl_z", "kl_w", "kl_m")
+    assert value == pytest.approx(-sum(terms[name].item() for name in names), rel=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_killed_runs_end_with_the_same_bytes(demos, tmp_path, seed):
-    flags = [*SMALL, "--total-updates", 300, "--seed", seed, "--demos", str(demos)]
+    flags = [*SMALL, "--total-updates", 150, "--seed", seed, "--demos", str(demos)]
     run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
     kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 15, seed, SCRIPT)
     run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
