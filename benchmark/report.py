@@ -166,11 +166,17 @@ def read_runs(folder: Path, steps: int, workers: int) -> list[dict]:
     return runs
 
 
-def read_known(folder: Path) -> list[dict]:
-    """The runs of an earlier report as `read_runs` gives them; without curves where the report has kept none."""
+def read_known(folder: Path, steps: int) -> list[dict]:
+    """The runs of an earlier report as `read_runs` gives them; without curves where the report has kept none.
+
+    Raises SystemExit where they are not of `steps`.
+    """
     curves = dict(np.load(folder / "curves.npz")) if (folder / "curves.npz").exists() else {}
     with open(folder / "runs.csv", newline="") as file:
         rows = [{key: number(key, value) for key, value in row.items()} for row in csv.DictReader(file)]
+    other = next((row["steps"] for row in rows if not 0.9 * steps < row["steps"] <= steps), None)
+    if other is not None:
+        raise SystemExit(f"--known {folder}: holds runs of {other:,} steps, not of {steps:,}")
     runs = [{"row": {key: value for key, value in row.items() if value != "" or key == "d_target"}} for row in rows]
     for run in runs:
         run["curves"] = dict(zip(CURVES, curves[key])) if (key := run_name(run["row"])) in curves else {}
@@ -832,7 +838,7 @@ def write_runs(out: Path, runs: list[dict]) -> None:
 def main(args: Args) -> None:
     found = read_runs(args.runs, args.steps, args.workers)
     of_folders = [run for run in found if "curves" in run]
-    known = read_known(args.known) if args.known else []
+    known = read_known(args.known, args.steps) if args.known else []
     runs = in_order(of_folders, known)
     if not runs:
         raise SystemExit(f"--runs {args.runs}: holds no run of {args.steps:,} steps")

@@ -307,7 +307,9 @@ def test_runs_whose_folders_are_gone_count_on(study, tmp_path):
 def test_an_earlier_report_without_curves(study, tmp_path):
     report.main(report.Args(runs=study, steps=102_400, out=tmp_path / "out", workers=1))
     (tmp_path / "out" / "curves.npz").unlink()
-    runs = report.read_known(tmp_path / "out")
+    with pytest.raises(SystemExit, match="not of 500,000"):
+        report.read_known(tmp_path / "out", 500_000)
+    runs = report.read_known(tmp_path / "out", 102_400)
     assert not any(run["curves"] for run in runs) and {run["row"]["d_target"] for run in runs} == {"", 0.03, 0.05}
     (tmp_path / "none").mkdir()
     report.main(
