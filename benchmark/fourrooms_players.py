@@ -1,7 +1,7 @@
 """PPO in FourRooms: runs -> one table of their returns beside the shortest ways from the same starts.
 
 for seed in 1 2 3; do
-  python cleanrl_thesis/ppo_fourrooms.py --seed $seed --save-demos 2600 --save-model --run-dir runs/fourrooms/11_seed$seed
+  python cleanrl_thesis/ppo_fourrooms.py --seed $seed --save-model --run-dir runs/fourrooms/11_seed$seed
 done
 python benchmark/fourrooms_players.py        # runs/fourrooms -> benchmark/results/fourrooms
 """

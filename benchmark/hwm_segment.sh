@@ -6,9 +6,9 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
-RUNGS=${RUNGS:-narrow faithful reset kl_w price no_budget} PLAYER=${PLAYER:-runs/fourrooms/11_seed1}
+RUNGS=${RUNGS:-narrow faithful reset kl_w price no_budget} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
 mkdir -p "$RUNS"
-"$PYTHON" cleanrl_thesis/ppo_fourrooms.py --save-demos 2600 --save-model --run-dir "$PLAYER" --resume
+"$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-demos 2300 --save-model --run-dir "$PLAYER" --resume
 # rung (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of it
 FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
 FAITHFUL+=" --stoch-w 16 --kl-m-scale 1 --max-segments 10"

@@ -1,7 +1,7 @@
 """The hierarchical world model (HWM) alone: reconstruction and segmentation of episodes (thesis section 3.3, Fig. 3.4).
 
-    python cleanrl_thesis/ppo_fourrooms.py --save-demos 2600 --run-dir runs/fourrooms11      # the episodes
-    python cleanrl_thesis/hwm_segment.py --demos runs/fourrooms11/demos                      # rung (e) of the ladder
+    python cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-demos 2300 --run-dir runs/rooms      # the episodes
+    python cleanrl_thesis/hwm_segment.py --demos runs/rooms/demos                                        # rung (e) of the ladder
 
 It is trained to maximise J_HWM (Eq. 3.3.5) on 25,000 observation-action pairs; the other episodes of the folder are held out,
 and measured as in section 3.5.1: z_0 from q(z), later z from p(z), w from q(w), the boundary m from p(m). `segmentation.json`
@@ -242,7 +242,7 @@ def complete_args(args: Args) -> Args:
     args.image_scale = (64 / args.frame_side) ** 2 if args.image_scale is None else args.image_scale
     require(0 < args.image_scale < math.inf, "--image-scale", args.image_scale, "must be greater than 0 and finite")
     require(not args.resume or args.run_dir is not None, "--resume", "", "needs --run-dir, the folder to go on in")
-    needed = "needed: a folder that `ppo_fourrooms.py --save-demos 2600` has written"
+    needed = "needed: a folder that `ppo_fourrooms.py --save-demos 2300` has written"
     require(args.demos is not None, "--demos", "", needed)
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")

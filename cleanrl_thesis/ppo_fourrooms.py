@@ -1,6 +1,7 @@
 """PPO from pixels in FourRooms: the agent whose episodes the hierarchical world model is trained on (thesis section 3.4).
 
-    python cleanrl_thesis/ppo_fourrooms.py --save-demos 2600 --run-dir runs/fourrooms11     # 25,000 pairs and held-out ones
+    python cleanrl_thesis/ppo_fourrooms.py --save-model                                                  # near-optimal play
+    python cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-demos 2300 --run-dir runs/rooms      # the episodes
     python cleanrl_thesis/ppo_fourrooms.py --env-id FourRooms19-v0 --save-model
 
 The task is built in (`gymnasium.make("cleanrl_thesis.ppo_fourrooms:FourRooms11-v0")`): MiniGrid's FourRooms with fixed doors,
@@ -14,7 +15,7 @@ run ends with the same bytes.
 | 19 × 19 cells | `FourRooms19-v0`: agent and goal anywhere, doors as MiniGrid draws them with seed 0 | MiniGrid; the thesis has fixed doors |
 | first direction of the agent | drawn | ours; the author's code has it face up |
 | algorithm | PPO; Stable-Baselines3 in the thesis | our own, settings chosen by measurement (the thesis gives none) |
-| demonstrations | sampled actions, 25,000 pairs in the thesis | `--demo-mode greedy` takes the best action |
+| demonstrations | sampled actions of a player stopped at 1,100,000 steps: 14.8 steps an episode, in the thesis 14.4 | the finished player hardly varies its ways: 0.015 nats an action; `--demo-mode greedy` takes the best one |
 """
 
 # /// script
@@ -97,7 +98,7 @@ class Args:
     save_model: bool = False
     """write `model.safetensors` at the end"""
     save_demos: int = 0
-    """episodes of the trained agent to write into `demos/`, one .npz each and a manifest; 2,600 are 25,000 pairs and more"""
+    """episodes of the trained agent to write into `demos/`, one .npz each and a manifest; 2,300 of a player stopped at 1,100,000 steps are 34,000 pairs"""
     demo_mode: Literal["sampled", "greedy"] = "sampled"
     """how the agent acts in `--save-demos`"""
     eval_episodes: int = 2_000

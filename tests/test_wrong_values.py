@@ -81,7 +81,7 @@ BAD_ROOMS = [
     (["--resume"], ["--resume", "--run-dir"]),
 ]
 BAD_HWM = [
-    (["--seed", 2], ["--demos", "ppo_fourrooms.py --save-demos 2600"]),
+    (["--seed", 2], ["--demos", "ppo_fourrooms.py --save-demos 2300"]),
     (["--demos", "no/such/folder"], ["--demos", "no/such/folder", "manifest"]),
     (["--demos", "x", "--budget", 1.5], ["--budget", "1.5", "between 0 and 1"]),
     (["--demos", "x", "--temperature", 0], ["--temperature", "0.0"]),
