@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,9 @@ import torch.nn.functional as F
 from conftest import ROOT, kill_twice, needs_compiler, run
 
 from cleanrl_thesis import dreamer_v2 as method
+
+sys.path.append(str(ROOT / "benchmark"))
+import dreamer_report  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "dreamer_v2.py"
 CPU = torch.device("cpu")
@@ -523,3 +527,40 @@ def test_the_dream_starts_from_what_was_seen(small_run, tmp_path):
     truth, dream = method.dream_frames(learner, learner.args, states, np.array([1, 1, 1, 1]))
     assert truth.shape == dream.shape == (5, 22, 22, 3) and truth.dtype == dream.dtype == np.uint8
     assert np.array_equal(truth, method.painter(11, 22).draw(4 * states[:, 0] + states[:, 1], states[:, 2]))
+
+
+# The report
+def test_steps_to_a_return_and_curves(tmp_path):
+    """Runs whose moving mean is known: the step of the 200th episode in a row with as much."""
+    for name, jump in (("dreamer_seed1", 300), ("dreamer_seed2", 500), ("hwm_seed1", 10_000)):
+        folder = tmp_path / "runs" / name
+        folder.mkdir(parents=True)
+        about = {"seed": int(name[-1]), "size": "xs", "env_id": "FourRooms11-v0"}
+        (folder / "args.json").write_text(json.dumps(about))
+        lines = [f"{10 * (i + 1)},{0.9 if i >= jump else 0.1},10" for i in range(1_000)]
+        (folder / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + "\n".join(lines) + "\n")
+        columns = "global_step,eval/real_return,eval/dreamed_return\n"
+        (folder / "updates.csv").write_text(columns + "5000,0.2,0.5\n10000,nan,nan\n")
+    runs = dreamer_report.read_runs(tmp_path / "runs")
+    rows = {(run["row"]["agent"], run["row"]["seed"]): run["row"] for run in runs}
+    assert rows["dreamer", 1]["steps_to_0.5"] == 10 * (300 + 100) and np.isnan(rows["hwm", 1]["steps_to_0.5"])
+    assert rows["dreamer", 1]["steps_to_0.85"] == 10 * (300 + 188)  # 0.1 + 0.8 · 188 / 200 is the first above 0.85
+    lines = dreamer_report.table([run["row"] for run in runs])
+    assert (
+        lines[2].startswith("| Dreamer | 2 | 5,000 ± 12,706 | ") and "| not reached | not reached | 0.100 |" in lines[3]
+    )
+    assert "| 0.300 ± 0.000 |" in lines[2]
+    dreamer_report.write_report(runs, tmp_path / "out")
+    assert (tmp_path / "out" / "fig_3_5.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_moving_mean():
+    values = np.random.default_rng(0).random(450)
+    means = dreamer_report.moving_mean(values)
+    for i in (0, 5, 198, 199, 200, 449):
+        assert means[i] == pytest.approx(values[max(0, i - 199) : i + 1].mean())
+
+
+def test_a_folder_without_runs_is_refused(tmp_path):
+    with pytest.raises(SystemExit, match="holds no run"):
+        dreamer_report.read_runs(tmp_path)

@@ -1,0 +1,165 @@
+"""The Dreamers in FourRooms: runs of benchmark/fourrooms.sh -> Fig. 3.5, and the steps to a return of 0.5 and of 0.85.
+
+    python benchmark/dreamer_report.py                              # runs/dreamer_xs -> benchmark/results/dreamer/xs
+
+Takes whatever part of the runs there is, as far as the shortest of them has come. A run has come to a return when the mean of
+its last 200 episodes is as high. Intervals are 95% t-intervals over seeds.
+"""
+
+import json
+import re
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from common import ROOT, commit, commit_of, write_csv
+from matplotlib.figure import Figure
+from scipy import stats
+
+AGENTS = {  # name of the runs -> title, script, colour
+    "dreamer": ("Dreamer", "dreamer_v2", "tab:blue"),
+    "hwm": ("HWM Dreamer", "hwm_dreamer", "tab:green"),
+    "hrl": ("HWM HRL Dreamer", "hwm_hrl_dreamer", "tab:purple"),
+    "hwm_fixed": ("HWM Dreamer, fixed interval", "hwm_dreamer", "tab:olive"),
+    "hrl_fixed": ("HWM HRL Dreamer, fixed interval", "hwm_hrl_dreamer", "tab:pink"),
+}
+WINDOW = 200  # episodes
+BINS = 200  # points of a curve
+LEVELS = (0.5, 0.85)  # learning, solved
+
+
+@dataclass
+class Args:
+    runs: Path = Path("runs/dreamer_xs")
+    """folder of the runs' folders"""
+    out: Path | None = None
+    """folder for figure, table and runs; default: benchmark/results/dreamer/{size}"""
+
+
+def moving_mean(returns: np.ndarray) -> np.ndarray:
+    """Mean of the last WINDOW episodes at the end of each, of fewer at first."""
+    sums, number = np.concatenate([[0], np.cumsum(returns)]), np.arange(1, len(returns) + 1)
+    begin = np.maximum(number - WINDOW, 0)
+    return (sums[number] - sums[begin]) / (number - begin)
+
+
+def steps_to(level: float, steps: np.ndarray, means: np.ndarray) -> float:
+    """The first step at which the mean of WINDOW episodes is as high; nan where it never is."""
+    reached = np.flatnonzero((means >= level) & (np.arange(len(means)) >= WINDOW - 1))
+    return float(steps[reached[0]]) if len(reached) else np.nan
+
+
+def read_run(folder: Path) -> dict:
+    """A run's row, and its moving mean over the steps. Columns of the comparison stand where the run has made one."""
+    args = json.loads((folder / "args.json").read_text())
+    table = np.loadtxt(folder / "episodes.csv", delimiter=",", skiprows=1, ndmin=2)
+    steps, means = table[:, 0], moving_mean(table[:, 1])
+    row = {"agent": re.sub(r"_seed\d+$", "", folder.name), "seed": args["seed"], "size": args["size"]}
+    row |= {"env_id": args["env_id"], "steps": int(steps[-1]), "episodes": len(steps)}
+    row |= {f"steps_to_{level}": steps_to(level, steps, means) for level in LEVELS} | {"last_200": float(means[-1])}
+    updates = np.genfromtxt(folder / "updates.csv", delimiter=",", names=True, deletechars="", ndmin=1)
+    for name in ("real", "dreamed"):
+        values = updates[f"eval/{name}_return"]
+        row[f"{name}_return"] = float(values[~np.isnan(values)][-1]) if (~np.isnan(values)).any() else np.nan
+    result = folder / "result.json"
+    ended = json.loads(result.read_text()) if result.exists() else {}
+    row |= {name: ended.get(name, "") for name in ("training_seconds", "script_sha256")}
+    row["greedy"] = ended["evaluation"]["mean"] if ended else np.nan
+    return {"row": row, "steps": steps, "means": means}
+
+
+def read_runs(folder: Path) -> list[dict]:
+    """All runs of known agents that have updates. Raises SystemExit where their sizes or tasks differ."""
+    paths = sorted(path.parent for path in folder.glob("*/updates.csv") if path.stat().st_size)
+    runs = [read_run(path) for path in paths if re.sub(r"_seed\d+$", "", path.name) in AGENTS]
+    kinds = {(run["row"]["size"], run["row"]["env_id"]) for run in runs}
+    if len(kinds) != 1:
+        raise SystemExit(f"error: --runs {folder}: " + ("holds runs of several kinds" if kinds else "holds no run"))
+    return runs
+
+
+def interval(values: list[float], digits: int) -> str:
+    """Mean and the half-width of its 95% t-interval."""
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return f"{mean:,.{digits}f}"
+    half = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / len(values) ** 0.5
+    return f"{mean:,.{digits}f} ± {half:,.{digits}f}"
+
+
+def table(rows: list[dict]) -> list[str]:
+    """One line for each agent; where not every seed has come to a return, how many have."""
+    lines = [
+        "| agent | seeds | steps to 0.5 | steps to 0.85 | last 200 episodes | greedy | dreamed less real return | minutes |"
+    ]
+    lines.append("|" + "---|" * 8)
+    for agent, (title, _, _) in AGENTS.items():
+        group = [row for row in rows if row["agent"] == agent]
+        if not group:
+            continue
+        cells = []
+        for level in LEVELS:
+            known = [row[f"steps_to_{level}"] for row in group if not np.isnan(row[f"steps_to_{level}"])]
+            some = f" ({len(known)} of {len(group)})" if 0 < len(known) < len(group) else ""
+            cells.append(interval(known, 0) + some if known else "not reached")
+        cells.append(interval([row["last_200"] for row in group], 3))
+        greedy = [row["greedy"] for row in group if not np.isnan(row["greedy"])]
+        cells.append(interval(greedy, 3) if greedy else "")
+        gaps = [row["dreamed_return"] - row["real_return"] for row in group if not np.isnan(row["dreamed_return"])]
+        cells.append(interval(gaps, 3) if gaps else "")
+        minutes = [row["training_seconds"] / 60 for row in group if row["training_seconds"] != ""]
+        cells.append(f"{np.mean(minutes):.0f}" if minutes else "")
+        lines.append(f"| {title} | {len(group)} | {' | '.join(cells)} |")
+    return lines
+
+
+def figure_3_5(runs: list[dict]) -> Figure:
+    """Fig. 3.5: the mean over seeds of the moving means, and their range, up to where the shortest run has come."""
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
+    groups = defaultdict(list)
+    for run in runs:
+        groups[run["row"]["agent"]].append(run)
+    for agent, (title, _, colour) in AGENTS.items():
+        group = groups[agent]
+        if not group:
+            continue
+        at = np.linspace(0, min(run["steps"][-1] for run in group), BINS + 1)[1:]
+        curves = np.array([np.interp(at, run["steps"], run["means"]) for run in group])
+        axes.plot(at, curves.mean(0), color=colour, label=f"{title}, {len(group)} seed{'s' * (len(group) > 1)}")
+        axes.fill_between(at, curves.min(0), curves.max(0), color=colour, alpha=0.15, linewidth=0)
+    for level in LEVELS:
+        axes.axhline(level, color="black", linestyle=":", linewidth=0.8)
+    row = runs[0]["row"]
+    axes.set_title(f"Fig. 3.5: {row['env_id']}, size {row['size']}; mean of {WINDOW} episodes, range over seeds")
+    axes.set(xlabel="environment steps", ylabel="episodic return", ylim=(0, 1))
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize="small")
+    return figure
+
+
+def write_report(runs: list[dict], out: Path) -> None:
+    """Write the figure, the table and the rows of the runs."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows = [run["row"] for run in runs]
+    write_csv(out / "runs.csv", rows)
+    scripts = {(AGENTS[row["agent"]][1], row["script_sha256"]) for row in rows if row["script_sha256"]}
+    made_at = ", ".join(f"{name}.py at {commit_of(name, digest)}" for name, digest in sorted(scripts))
+    text = [
+        f"`benchmark/fourrooms.sh`, {made_at or 'runs that go on'}; this report at {commit()}. One thread each.",
+        "",
+    ]
+    text += table(rows)
+    (out / "table.md").write_text("\n".join(text) + "\n")
+    figure_3_5(runs).savefig(out / "fig_3_5.png", dpi=110)
+    print("\n".join(text))
+
+
+if __name__ == "__main__":
+    arguments = tyro.cli(Args, description=__doc__.split("\n\n")[0])
+    found = read_runs(arguments.runs)
+    size = found[0]["row"]["size"]
+    write_report(found, arguments.out or ROOT / "benchmark" / "results" / "dreamer" / size)
