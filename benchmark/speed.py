@@ -6,8 +6,9 @@
     python benchmark/speed.py torcs                                # the simulator alone, and DDPG on it; about 12 minutes
     python benchmark/speed.py gail                                 # GAIL beside TRPO without it; about 3 minutes
     python benchmark/speed.py rooms                                # FourRooms beside MiniGrid; about a minute
+    python benchmark/speed.py dreamer                              # a Dreamer's gradient step and its parts; about 8 minutes
 
-Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,torcs,gail,rooms}.json` and `.md`: the median of each contender and of its ratios to
+Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,torcs,gail,rooms,dreamer}.json` and `.md`: the median of each contender and of its ratios to
 the peer, round by round, with their range. The ratios are the result: the machine's own speed drifts.
 """
 
@@ -31,7 +32,7 @@ PEER = "stable-baselines3"
 
 @dataclass
 class Args:
-    what: tyro.conf.Positional[Literal["ppo", "apple", "torcs", "gail", "rooms"]]
+    what: tyro.conf.Positional[Literal["ppo", "apple", "torcs", "gail", "rooms", "dreamer"]]
     """what to time"""
     rounds: int = 4
     """how often each contender runs, in turn"""
@@ -106,7 +107,7 @@ def measure(work: Work, contenders: dict, rounds: int) -> dict:
         for name, contender in contenders.items():
             figures[name].append(contender())
             speed = figures[name][-1]["steps_per_second"]
-            print(f"{name_of_work} round {round_number + 1} {name}: {speed:,.0f} steps/s", flush=True)
+            print(f"{name_of_work} round {round_number + 1} {name}: {speed:,.4g} steps/s", flush=True)
     speeds = {name: [row["steps_per_second"] for row in rows] for name, rows in figures.items()}
     peer_speeds = speeds[next(iter(contenders))]
     ratios = {name: [own / peer for own, peer in zip(speeds[name], peer_speeds)] for name in contenders}
@@ -173,7 +174,9 @@ def table(results: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write_results(args: Args, name: str, flags: str, results: list[dict], more: dict | None = None) -> None:
+def write_results(
+    args: Args, name: str, flags: str, results: list[dict], more: dict | None = None, text: str | None = None
+) -> None:
     """Write the figures as JSON and as a table; `flags` are those that this part of the measurement depends on."""
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
     line = f"python benchmark/speed.py {args.what}{flags} --rounds {args.rounds}"
@@ -181,7 +184,8 @@ def write_results(args: Args, name: str, flags: str, results: list[dict], more: 
     args.out.mkdir(parents=True, exist_ok=True)
     figures = {**about, "cores": os.cpu_count(), **(more or {}), "results": results}
     (args.out / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
-    text = f"Steps per second, {args.rounds} rounds in turn, one thread each (`{line}`, commit {commit[:7]})\n\n{table(results)}"
+    what = "Gradient steps" if text else "Steps per second"
+    text = f"{what}, {args.rounds} rounds in turn, one thread each (`{line}`, commit {commit[:7]})\n\n{text or table(results)}"
     for key, speeds in (more or {}).items():
         median, low, high = (f"{value / 1e6:.2f}" for value in (statistics.median(speeds), min(speeds), max(speeds)))
         text += f"\n{key}: {median} million steps/s ({low} to {high})\n"
@@ -236,9 +240,53 @@ def time_rooms(args: Args) -> None:
     write_results(args, "rooms", "", [measure(work, rooms_contenders(work), args.rounds) for work in works])
 
 
+DREAMERS = {  # rows of the result: script, size, the contenders' flags, of which the first is the plain form
+    "xs": ("dreamer_v2", "xs", ["", "--bf16"]),
+    "m: deter 200, CNN of depth 16, 16 × 50": ("dreamer_v2", "m", ["", "--bf16"]),
+    "xs, HWM Dreamer": ("hwm_dreamer", "xs", ["", "--bf16"]),
+    "xs, HWM HRL Dreamer": ("hwm_hrl_dreamer", "xs", ["", "--bf16"]),
+}
+
+
+def dreamer_table(results: list[dict]) -> str:
+    """Milliseconds of a gradient step, its ratio to the plain form, and milliseconds of its parts."""
+    parts = list(results[0]["milliseconds"]["plain"][0])
+    lines = [f"| size | form | ms | ratio | range | {' | '.join(parts)} |", "|" + "---|" * (5 + len(parts))]
+    for row in results:
+        for name, speeds in row["steps_per_second"].items():
+            ratios = [1 / ratio for ratio in row["ratio"][name]]
+            cells = [
+                row["env_id"],
+                name,
+                f"{1_000 / statistics.median(speeds):.0f}",
+                f"{statistics.median(ratios):.2f}",
+            ]
+            cells.append(f"{min(ratios):.2f} to {max(ratios):.2f}")
+            rounds = row["milliseconds"][name]
+            cells += [f"{statistics.median(each[part] for each in rounds):.1f}" for part in parts]
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def time_dreamer(args: Args) -> None:
+    results = []
+    for title, (script, size, forms) in DREAMERS.items():
+        parts: dict[str, list] = {}
+
+        def contender(flags: str, script=script, size=size, parts=parts) -> dict:
+            figures = time_peer("dreamer_step.py", script, size, *flags.split())
+            parts.setdefault(flags or "plain", []).append(figures.pop("milliseconds"))
+            return figures
+
+        contenders = {flags or "plain": lambda flags=flags, run=contender: run(flags) for flags in forms}
+        results.append({**measure(Work(title, None, 1), contenders, args.rounds), "milliseconds": parts})
+    write_results(args, "dreamer", "", results, text=dreamer_table(results))
+
+
 if __name__ == "__main__":
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # before numpy is imported
     arguments = tyro.cli(Args)
     times = {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail, "rooms": time_rooms}
+    times |= {"dreamer": time_dreamer}
     times[arguments.what](arguments)

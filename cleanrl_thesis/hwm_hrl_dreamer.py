@@ -758,19 +758,28 @@ class ConvEncoder(nn.Module):
 
 
 class ConvDecoder(nn.Module):
-    """Four transposed convolutions to 64 × 64 pixels."""
+    """Four transposed convolutions to 64 × 64 pixels; the first one, over a single pixel, is a linear map."""
 
     def __init__(self, input_size: int, depth: int):
         super().__init__()
+        channels = [4 * depth, 2 * depth, depth, 3]
         self.spread = nn.Linear(input_size, 32 * depth)
-        channels, kernels, layers = [32 * depth, 4 * depth, 2 * depth, depth, 3], (5, 5, 6, 6), []
-        for a, b, kernel in zip(channels, channels[1:], kernels):
+        self.first = nn.Linear(32 * depth, 5 * 5 * channels[0])
+        layers = [nn.SiLU()]
+        for a, b, kernel in zip(channels, channels[1:], (5, 6, 6)):
             layers += [nn.ConvTranspose2d(a, b, kernel, 2), nn.SiLU()]
         self.layers = nn.Sequential(*layers[:-1]).to(memory_format=torch.channels_last)
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """(N, features) -> (N, 64, 64, 3)"""
-        return self.layers(self.spread(features)[:, :, None, None]).permute(0, 2, 3, 1)
+        pixels = self.first(self.spread(features)).unflatten(1, (5, 5, -1))  # (N, 5, 5, 4 depth)
+        return self.layers(pixels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)  # a permuted picture is channels_last
+
+
+def as_computed(x: torch.Tensor) -> torch.Tensor:
+    """x in the type that matrix products are computed in: cast once, and not before each of them."""
+    device = x.device.type
+    return x.to(torch.get_autocast_dtype(device)) if torch.is_autocast_enabled(device) else x
 
 
 def uniforms(*shape: int, device: torch.device) -> torch.Tensor:
@@ -781,7 +790,7 @@ def uniforms(*shape: int, device: torch.device) -> torch.Tensor:
 def one_hot_sample(logits: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
     """A one-hot draw from the softmax of logits (..., C), by one uniform number for each (...): the inverse of its distribution."""
     below = logits.detach().softmax(-1).cumsum(-1)
-    index = (below < uniform[..., None] * below[..., -1:]).sum(-1, keepdim=True)
+    index = torch.searchsorted(below, uniform[..., None] * below[..., -1:])
     return torch.zeros_like(below).scatter_(-1, index, 1.0)
 
 
@@ -895,7 +904,7 @@ class HWM(nn.Module):
         z, w, side, tiles = dz + sz, dw + sw, args.frame_side, args.encoder == "tiles"
         self.feature_size = z + w
         self.register_buffer("frame_mean", torch.full((side, side, 3), 127.5))
-        self.register_buffer("frame_scale", torch.full((3,), 255.0))
+        self.register_buffer("frame_scale", torch.full((side, side, 3), 255.0))
         self.encoder = TileEncoder(side, args.depth) if tiles else ConvEncoder(args.depth)
         self.embed = nn.Linear(self.encoder.size, hidden)
         self.posterior_m = Posterior(hidden, 64, args.read_bias, args.boundary_bound)  # q(m | O)
@@ -1045,7 +1054,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     actions = F.one_hot(data.actions, model.num_actions).float()
     made = model.observe(embed, actions, data.first, temperature)
     flat = Belief(*(part.flatten(0, 1) for part in made.belief))
-    image = 0.5 * (model.decode(flat).float() - frames).square().flatten(1).sum(1).mean()
+    image = 0.5 * F.mse_loss(model.decode(flat).float(), frames, reduction="sum") / len(frames)
     p_z, p_w = model.distribution(model.prior_z, made.belief.c), model.distribution(model.prior_w, made.belief.h)
     weight = made.reads.detach() if args.detach_kl_z else made.reads  # Eq. 3.3.7 weighs KL_z by q(M)
     kl_z = weight * balanced(kl_normal, made.q_z, p_z, args.kl_balance)
@@ -1053,7 +1062,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     decides = 1 - made.forced[1:]  # q(m_t) pairs with p(m_t) where step t + 1 was free to read or to copy
     kl_m = decides * balanced(kl_bernoulli, made.q_m[:-1], made.p_m, args.kl_balance)
     read_rate = (made.reads[1:] * decides).sum() / decides.sum().clamp(min=1)
-    features = flat.features()
+    features = as_computed(flat.features())
     target = data.rewards.tanh() if args.tanh_reward else data.rewards
     reward = 0.5 * (model.reward(features).squeeze(-1).float() - target.flatten()).square().mean()
     goes_on = model.discount(features).squeeze(-1).float()
@@ -1148,9 +1157,10 @@ def imagine(model: nn.Module, behaviour: Behaviour, state: NamedTuple, horizon: 
         read = (state.age == 0).float()  # (N, 1): m_h = 1
         skills.append(read * behaviour.choose(features[-1], skill_choices[h + 1]) + (1 - read) * skills[-1])
         decides.append(read.squeeze(1))
-    rewards, goes_on = model.outcome(torch.stack(features[1:]))
+    stacked = as_computed(torch.stack(features))  # (H + 1, N, F)
+    rewards, goes_on = model.outcome(stacked[1:])
     columns = (torch.stack(column) for column in (skills, decides))
-    return Dream(torch.stack(features), torch.stack(actions), rewards, gamma * goes_on, *columns)
+    return Dream(stacked, torch.stack(actions), rewards, gamma * goes_on, *columns)
 
 
 def lambda_return(
