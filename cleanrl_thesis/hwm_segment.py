@@ -174,6 +174,8 @@ class Args:
     """the decoder sees c_t too (Eq. 3.3.1), not only v_t: c_t knows of frames a step late"""
     read_price: float = 0.0
     """price of a read, on the mean read rate"""
+    surprise_price: float = 0.0
+    """price of a nat of KL_z at a read, above the mean of all reads: under a budget only differences choose between reads"""
     budget: float = 0.23
     """share of steps read without a price, from 1 over 80% of the updates"""
     budget_start: float = 1.0
@@ -223,7 +225,7 @@ def complete_args(args: Args) -> Args:
     args.stop_at = args.attempts * args.total_updates if args.stop_at is None else args.stop_at
     counts = "num_threads checkpoint_interval attempts stop_at train_pairs heldout_episodes total_updates batch_size hidden_size"
     counts += " deter_z stoch_z deter_w stoch_w"
-    scales = "kl_z_scale kl_w_scale kl_m_scale read_price budget_price boundary_bound"
+    scales = "kl_z_scale kl_w_scale kl_m_scale read_price surprise_price budget_price boundary_bound"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("chunk_length", lambda x: x >= 2, "must be at least 2"),
@@ -609,6 +611,9 @@ def hwm_loss(model: HWM, data: Sequence, temperature: float, budget: float) -> t
     read_rate = (made.reads * chosen).sum() / chosen.sum()
     loss = (reconstruction + args.kl_z_scale * kl_z + args.kl_w_scale * kl_w + args.kl_m_scale * kl_m).mean()
     loss = loss + args.read_price * read_rate + args.budget_price * F.relu(read_rate - budget)
+    free = made.reads * chosen  # (T, B): reads that the model chose
+    surprise = (kl_z - (kl_z * free).sum() / free.sum().clamp(min=1)).detach()
+    loss = loss + args.surprise_price * (free * free.detach() * surprise).sum() / chosen.sum()
     terms = {"reconstruction": reconstruction, "kl_z": kl_z, "kl_w": kl_w, "kl_m": kl_m, "read_rate": read_rate}
     agreement = ((made.p_m > 0) == (made.q_m > 0)).float()
     terms["agreement"] = (agreement * decides).sum() / decides.sum()

@@ -13,6 +13,7 @@ from conftest import ROOT, kill_twice, needs_compiler, run
 from cleanrl_thesis import ppo_fourrooms as method
 
 sys.path.append(str(ROOT / "benchmark"))
+import fourrooms_cuts  # noqa: E402
 import fourrooms_players  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "ppo_fourrooms.py"
@@ -233,3 +234,36 @@ def test_table_of_the_players(small_run, tmp_path):
     line = fourrooms_players.table(rows).splitlines()[2]
     assert line.startswith("| FourRooms11-v0 | 1 | 768 | 0 |")
     assert f"| {evaluation['mean'] / evaluation['optimal']:.3f} |" in line
+
+
+def play_once(player: fourrooms_cuts.Player, pose: int, goal: int, ends, rng) -> tuple[int, int]:
+    """Where a segment is left, and after how many steps, by playing it."""
+    for t in range(1, 101):
+        following = player.moves(pose, goal)
+        pose = int(rng.choice(list(following), p=list(following.values())))
+        if pose == fourrooms_cuts.END or ends(pose, t):
+            return pose, t
+    raise AssertionError
+
+
+def test_entries_of_segments_are_those_of_play():
+    """Where a room is left, and after how long, by the recursion and by playing it 4,000 times."""
+    player, rng = fourrooms_cuts.Player(0.1), np.random.default_rng(0)
+    pose, goal = (int(value) for value in player.maze.starts[5_000])
+    ends = fourrooms_cuts.by_label(player.maze.rooms)(pose)
+    left, length = fourrooms_cuts.entry(player, pose, goal, ends)
+    played = [play_once(player, pose, goal, ends, rng) for _ in range(4_000)]
+    assert sum(left.values()) == pytest.approx(1, abs=1e-4)
+    assert length == pytest.approx(np.mean([t for _, t in played]), rel=0.05)
+    for after, share in left.items():
+        assert share == pytest.approx(np.mean([where == after for where, _ in played]), abs=0.03)
+
+
+def test_costs_of_segments_known_by_hand():
+    """A read at every step tells one bit wherever two actions are as good; one that never comes tells nothing."""
+    player, starts = fourrooms_cuts.Player(0.0), method.maze(11).starts[::997]
+    rate, bits = fourrooms_cuts.cost(player, starts, lambda begin: lambda pose, t: False)
+    assert (rate, bits) == (0, 0)
+    rate, bits = fourrooms_cuts.cost(player, starts, lambda begin: lambda pose, t: True)
+    lengths = player.steps[starts[:, 0], starts[:, 1]]
+    assert rate == pytest.approx((lengths - 1).sum() / lengths.sum()) and 0 < bits < 0.5
