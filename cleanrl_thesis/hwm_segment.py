@@ -114,7 +114,7 @@ class Args:
     """factor on the red channel: the agent is small, and would be found late"""
 
     # Algorithm
-    attempts: int = 4
+    attempts: int = 1
     """models trained one after the other, each from weights of its own; that with the greatest J_HWM is kept"""
     total_updates: int = 3_000
     """gradient steps of an attempt"""
@@ -174,12 +174,8 @@ class Args:
     """the decoder sees c_t too (Eq. 3.3.1), not only v_t: c_t knows of frames a step late"""
     read_price: float = 0.0
     """price of a read, on the mean read rate"""
-    surprise_price: float = 0.0
-    """price of a nat of KL_z at a read, above the mean of all reads: under a budget only differences choose between reads"""
     budget: float = 0.23
     """share of steps read without a price, from 1 over 80% of the updates"""
-    budget_start: float = 1.0
-    """that share at first"""
     budget_price: float = 50.0
     """price of the reads beyond it, on the mean read rate; 0: no budget"""
 
@@ -225,7 +221,7 @@ def complete_args(args: Args) -> Args:
     args.stop_at = args.attempts * args.total_updates if args.stop_at is None else args.stop_at
     counts = "num_threads checkpoint_interval attempts stop_at train_pairs heldout_episodes total_updates batch_size hidden_size"
     counts += " deter_z stoch_z deter_w stoch_w"
-    scales = "kl_z_scale kl_w_scale kl_m_scale read_price surprise_price budget_price boundary_bound"
+    scales = "kl_z_scale kl_w_scale kl_m_scale read_price budget_price boundary_bound"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("chunk_length", lambda x: x >= 2, "must be at least 2"),
@@ -234,7 +230,7 @@ def complete_args(args: Args) -> Args:
         ("max_grad_norm", lambda x: x > 0, "must be greater than 0"),
         (scales, lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
         ("read_bias std_bias", math.isfinite, "must be finite"),
-        ("kl_balance budget budget_start", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
+        ("kl_balance budget", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("temperature", lambda x: 0 < x <= 1, "must be greater than 0 and at most 1"),
         ("max_segment_length max_segments", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
@@ -611,9 +607,6 @@ def hwm_loss(model: HWM, data: Sequence, temperature: float, budget: float) -> t
     read_rate = (made.reads * chosen).sum() / chosen.sum()
     loss = (reconstruction + args.kl_z_scale * kl_z + args.kl_w_scale * kl_w + args.kl_m_scale * kl_m).mean()
     loss = loss + args.read_price * read_rate + args.budget_price * F.relu(read_rate - budget)
-    free = made.reads * chosen  # (T, B): reads that the model chose
-    surprise = (kl_z - (kl_z * free).sum() / free.sum().clamp(min=1)).detach()
-    loss = loss + args.surprise_price * (free * free.detach() * surprise).sum() / chosen.sum()
     terms = {"reconstruction": reconstruction, "kl_z": kl_z, "kl_w": kl_w, "kl_m": kl_m, "read_rate": read_rate}
     agreement = ((made.p_m > 0) == (made.q_m > 0)).float()
     terms["agreement"] = (agreement * decides).sum() / decides.sum()
@@ -756,7 +749,7 @@ def schedule(args: Args, update: int) -> tuple[float, float, float]:
     update, done = update % args.total_updates, update % args.total_updates / args.total_updates
     ramp = min(1.0, done / 0.8)
     rate = args.learning_rate * min(1.0, (update + 1) / 100) * (1.0 if done < 0.7 else 0.3)
-    return rate, 1 + (args.temperature - 1) * ramp, args.budget_start + (args.budget - args.budget_start) * ramp
+    return rate, 1 + (args.temperature - 1) * ramp, 1 + (args.budget - 1) * ramp
 
 
 def train_step(model: HWM, optimizer: torch.optim.Adam, data: Sequence, update: int) -> dict[str, torch.Tensor]:
