@@ -273,6 +273,25 @@ def test_z_of_the_prior_needs_no_frame_after_the_first():
         assert torch.allclose(made.belief.v[t], expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("sees", [True, False])
+def test_c_is_made_from_w_and_the_action_where_it_sees_them(sees):
+    model = make_model(c_sees_w=sees)
+    sizes = [SIZES[name] for name in ("deter_z", "stoch_z", "deter_w", "stoch_w")]
+    state, zero = method.Belief(*(torch.randn(2, size) for size in sizes)), torch.zeros(2, 1)
+    embed, noise = torch.randn(2, model.args.hidden_size), [torch.zeros(2, size) for size in (sizes[1], sizes[3])]
+
+    def c(state, action):
+        taken = torch.nn.functional.one_hot(torch.tensor(action), 3).float()
+        return model.step(state, taken, zero + 1, zero, embed, noise, False)[0].c
+
+    plain = c(state, [0, 1])
+    assert torch.equal(c(state, [2, 1])[0], plain[0]) != sees
+    for part in ("h", "y"):
+        other = state._replace(**{part: torch.randn_like(getattr(state, part))})
+        assert torch.equal(c(other, [0, 1]), plain) != sees, part
+    assert not torch.equal(c(state._replace(v=state.v + 1), [0, 1]), plain)
+
+
 @pytest.mark.parametrize("part", ["c", "h"])
 def test_the_decoder_sees_what_it_is_told_to(part):
     belief = method.Belief(*(torch.randn(2, SIZES[name]) for name in ("deter_z", "stoch_z", "deter_w", "stoch_w")))
