@@ -14,6 +14,7 @@ same bytes.
 | high-level return | V_λ^{H,τ} over segments | on the clock of the steps: rewards within a segment are summed and discounted, λ counts at its end; a segment that the dream does not finish ends with V^L(w, z, e) |
 | Eq. 3.3.16, 3.3.17 | summed over the decisions | the mean over them, weighed by how likely the dream comes to each |
 | low-level return | V_λ^{L,h} | goes on over the boundaries |
+| decisions of π^H | where a segment begins | there, and at each dream's start, most of which lie within a segment |
 | boundaries, acting, departures of the model | | as in `hwm_dreamer.py` |
 
 Nothing makes π^L use its skill: `losses/skill_information` is I(e; a | w, z) in nats.
@@ -171,10 +172,12 @@ class Args:
     """weight of KL[q(w) ‖ p(w)] (Eq. 3.3.5: 1)"""
     kl_m_scale: float = 0.3
     """weight of KL[q(m) ‖ p(m)] (Eq. 3.3.5: 1)"""
+    kl_warmup: int | None = None
+    """updates over which the weights of KL_z and KL_w grow from a tenth"""
     kl_balance: float = 0.8
     """share of each KL term's gradient that trains p, the rest trains q (DreamerV2)"""
     detach_kl_z: bool = True
-    """KL_z weighs the reads, and does not price them (VTA); off: Eq. 3.3.7"""
+    """KL_z counts at the reads, and does not price them (VTA); off: Eq. 3.3.7"""
     temperature: float = 0.3
     """last temperature of the binary Gumbel samples of m; from 1 over `--budget-updates`"""
     boundary_bound: float = 4.0
@@ -224,7 +227,7 @@ class Args:
     slow_interval: int = 100
     """updates between copies of the critic to the slow critic"""
     weight_decay: float = 1e-6
-    """Adam's decoupled weight decay"""
+    """share of each weight that an update takes away"""
     max_grad_norm: float = 100.0
     """bound on the norm of each gradient; inf for none"""
 
@@ -241,13 +244,13 @@ SIZES = {  # features are as many as the baseline's
     }
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
     | {"batch_size": 24, "chunk_length": 10, "starts": 128, "gamma": 0.99, "image_scale": 0.25}
-    | {"kl_z_scale": 0.1, "kl_w_scale": 0.1, "reward_scale": 10.0, "tanh_reward": False}
+    | {"kl_z_scale": 1.0, "kl_w_scale": 1.0, "kl_warmup": 1_000, "reward_scale": 10.0, "tanh_reward": False}
     | {"model_learning_rate": 1e-3, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
     | {"adam_eps": 1e-8, "ent_coef": 3e-3},
     "thesis": {"encoder": "cnn", "frame_side": 64, "depth": 48, "deter_z": 300, "stoch_z": 512, "deter_w": 300}
     | {"stoch_w": 512, "hidden_size": 600, "head_size": 400, "head_layers": 4, "head_norm": False}
     | {"batch_size": 16, "chunk_length": 50, "starts": 800, "gamma": 0.999, "image_scale": 1.0}
-    | {"kl_z_scale": 0.1, "kl_w_scale": 0.1, "reward_scale": 1.0, "tanh_reward": True}
+    | {"kl_z_scale": 0.1, "kl_w_scale": 0.1, "kl_warmup": 0, "reward_scale": 1.0, "tanh_reward": True}
     | {"model_learning_rate": 2e-4, "actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4}
     | {"adam_eps": 1e-5, "ent_coef": 1e-3},
 }
@@ -315,7 +318,7 @@ def complete_args(args: Args) -> Args:
         ("gamma gae_lambda kl_balance budget", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("temperature", lambda x: 0 < x <= 1, "must be greater than 0 and at most 1"),
         ("std_bias read_bias", math.isfinite, "must be finite"),
-        ("fixed_interval", lambda x: x >= 0, "must be at least 0"),
+        ("fixed_interval kl_warmup", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
         (
             "prefill",
@@ -334,6 +337,10 @@ def complete_args(args: Args) -> Args:
     )
     fits = args.prefill // args.num_envs > args.chunk_length
     require(fits, "--prefill", args.prefill, "must give each game more steps than --chunk-length")
+    allowed = f"must be less than --chunk-length {args.chunk_length}, or no chunk would hold a segment's end"
+    require(args.fixed_interval < args.chunk_length, "--fixed-interval", args.fixed_interval, allowed)
+    more = args.prefill < args.total_timesteps
+    require(more, "--prefill", args.prefill, f"must be less than --total-timesteps {args.total_timesteps}")
     if args.encoder == "cnn":
         require(args.frame_side == 64, "--frame-side", args.frame_side, "must be 64 with --encoder cnn")
     holds = 8 <= args.frame_side <= 128 and args.frame_side % 2 == 0
@@ -642,11 +649,14 @@ class Chunks(NamedTuple):
 class Replay:
     """A row of records for each game, one episode after the other, in a file of the run's folder that is written in place."""
 
-    def __init__(self, path: Path, args: Args):
+    def __init__(self, path: Path, args: Args, goes_on: bool = False):
+        """Raises RunError where the file of a run that goes on is not there whole."""
         self.args, self.painter = args, painter(ROOM_SIZES[args.env_id], args.frame_side)
         capacity = 2 * args.total_timesteps // args.num_envs + 2  # an episode has a first record and at least one more
-        mode = "r+" if path.exists() else "w+"
-        self.rows = np.memmap(path, RECORD, mode, shape=(args.num_envs, capacity))
+        is_whole = path.exists() and path.stat().st_size == args.num_envs * capacity * RECORD.itemsize
+        if goes_on and not is_whole:
+            raise RunError(f"{path}: missing or cut short; the run cannot go on without its replay")
+        self.rows = np.memmap(path, RECORD, "r+" if goes_on else "w+", shape=(args.num_envs, capacity))
         self.lengths = np.zeros(args.num_envs, np.int64)
 
     def add(self, games: np.ndarray, state: np.ndarray, **columns) -> None:
@@ -790,7 +800,9 @@ def uniforms(*shape: int, device: torch.device) -> torch.Tensor:
 def one_hot_sample(logits: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
     """A one-hot draw from the softmax of logits (..., C), by one uniform number for each (...): the inverse of its distribution."""
     below = logits.detach().softmax(-1).cumsum(-1)
-    index = torch.searchsorted(below, uniform[..., None] * below[..., -1:])
+    index = torch.searchsorted(below, uniform[..., None] * below[..., -1:]).clamp(
+        max=logits.shape[-1] - 1
+    )  # nan: the last
     return torch.zeros_like(below).scatter_(-1, index, 1.0)
 
 
@@ -1040,6 +1052,12 @@ class HWM(nn.Module):
         return self.reward(features).squeeze(-1).float(), torch.sigmoid(self.discount(features).squeeze(-1).float())
 
 
+def warm_up(args: Args, updates: int) -> float:
+    """The share of its weight that the KL divergence has, from a tenth to all over `--kl-warmup` updates."""
+    share = (updates + 1) / args.kl_warmup if args.kl_warmup else 1.0
+    return min(1.0, max(0.1, share))
+
+
 def schedule(args: Args, updates: int) -> tuple[float, float]:
     """Temperature and read budget after so many updates."""
     ramp = min(1.0, updates / args.budget_updates)
@@ -1068,13 +1086,20 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     goes_on = model.discount(features).squeeze(-1).float()
     discount = F.binary_cross_entropy_with_logits(goes_on, 1 - data.terminals.flatten())
     loss = args.image_scale * image + args.reward_scale * reward + args.discount_scale * discount
-    loss = loss + args.kl_z_scale * kl_z.mean() + args.kl_w_scale * kl_w.mean() + args.kl_m_scale * kl_m.mean()
+    kl_of_states = args.kl_z_scale * kl_z.mean() + args.kl_w_scale * kl_w.mean()
+    loss = loss + warm_up(args, updates) * kl_of_states + args.kl_m_scale * kl_m.mean()
     loss = loss + args.budget_price * F.relu(read_rate - budget)
     inside = 1 - data.first  # a first frame costs tens of nats, which say nothing of the dynamics
-    parts = {"image": image, "reward": reward, "discount": discount, "kl_w": kl_w.mean(), "kl_m": kl_m.mean()}
-    parts |= {"kl_z": (kl_z * inside).sum() / (made.reads.detach() * inside).sum().clamp(min=1)}
+    read = made.reads.detach() * inside
+    parts = {"image": image, "reward": reward, "discount": discount, "kl_m": kl_m.mean()}
+    parts |= {"kl_z": (kl_z * inside).sum() / read.sum().clamp(min=1)}
+    parts |= {"kl_w": (kl_w * inside).sum() / inside.sum().clamp(min=1)}
     agreement = ((made.p_m > 0) == (made.q_m[:-1] > 0)).float() * decides
-    parts |= {"read_rate": read_rate, "agreement": agreement.sum() / decides.sum().clamp(min=1)}
+    parts |= {
+        "read_rate": read.sum() / inside.sum().clamp(min=1),
+        "agreement": agreement.sum() / decides.sum().clamp(min=1),
+    }
+    parts |= {"segment_length": inside.sum() / read.sum().clamp(min=1)}
     return loss, made.belief, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
 
@@ -1229,7 +1254,12 @@ def behaviour_loss(
     high_critic = (high_weights * errors).sum() / number  # Eq. 3.3.16
     losses = {"actor": actor / weights.numel(), "critic": critic}
     losses |= {"high_actor": high_actor / number, "high_critic": high_critic}
-    parts = {**losses, "entropy": entropy, "high_entropy": high_entropy, "advantage_std": (returns - values[:-1]).std()}
+    parts = {
+        **losses,
+        "entropy": entropy,
+        "high_entropy": high_entropy,
+        "advantage_std": (returns - values[:-1]).std(correction=0),
+    }
     parts |= {
         "dream_return": returns.mean(),
         "dream_reward": dream.rewards.max(),
@@ -1266,13 +1296,14 @@ class Learner:
 
     def make_optimizer(self, name: str) -> torch.optim.AdamW:
         args = self.args
-        settings = {"weight_decay": args.weight_decay, "fused": True, "eps": 1e-5 if name == "model" else args.adam_eps}
         rates = {
             "model": args.model_learning_rate,
             "actor": args.actor_learning_rate,
             "critic": args.critic_learning_rate,
         }
-        return torch.optim.AdamW(self.modules[name].parameters(), rates[name.split("_")[-1]], **settings)
+        rate, eps = rates[name.split("_")[-1]], 1e-5 if name == "model" else args.adam_eps
+        decay = args.weight_decay / rate  # torch multiplies it by the rate
+        return torch.optim.AdamW(self.modules[name].parameters(), rate, eps=eps, weight_decay=decay, fused=True)
 
     def descend(self, **losses: torch.Tensor) -> None:
         """One step of Adam for each named loss."""
@@ -1304,6 +1335,7 @@ class Learner:
         args = self.args
         with self.arithmetic():
             dream = imagine(self.model, self.behaviour, begins, args.horizon, args.gamma)
+        with self.arithmetic():  # anew: older versions of torch keep weights that were cast without a gradient
             losses, parts = behaviour_loss(self.behaviour, dream, args.gae_lambda, args.ent_coef)
         self.descend(**losses)
         self.updates += 1
@@ -1413,7 +1445,8 @@ class Player:
             skills = behaviour.high_policy(features)
             best = F.one_hot(skills.argmax(-1), behaviour.num_skills).float()
             drawn = best if greedy else one_hot_sample(skills, uniforms(len(skills), device=skills.device))
-            self.skill = torch.where(self.state.age == 0, drawn, self.skill)
+            has_none = self.skill.sum(-1, keepdim=True) == 0  # within a segment that began in random play
+            self.skill = torch.where((self.state.age == 0) | has_none, drawn, self.skill)
             logits = behaviour.policy(features, self.skill)
         best = F.one_hot(logits.argmax(-1), logits.shape[-1]).float()
         self.action = best if greedy else one_hot_sample(logits, uniforms(len(logits), device=logits.device))
@@ -1697,7 +1730,8 @@ def dreamed_returns(learner: Learner, args: Args, seeds: list[int]) -> np.ndarra
     player.observe(obs, np.ones(len(seeds), bool))
     with learner.arithmetic():
         dream = imagine(learner.model, learner.behaviour, player.state, MAX_STEPS, 1.0)
-    return (dream_weights(dream.discounts) * dream.rewards).sum(0).cpu().numpy()
+    rewards = dream.rewards.clamp(-0.999, 0.999).atanh() if args.tanh_reward else dream.rewards
+    return (dream_weights(dream.discounts) * rewards).sum(0).cpu().numpy()
 
 
 def compare_dream(learner: Learner, args: Args, episodes: int = 200) -> dict[str, float]:
@@ -1914,7 +1948,9 @@ def main(args: Args) -> int:
     model = HWM(args, int(ROOM_ACTIONS.n))
     set_frame_statistics(model, args)
     learner = Learner(args, model, device)
-    collector = Collector(args, Replay(run_dir / "replay.dat", args), Player(learner, args.num_envs))
+    collector = Collector(
+        args, Replay(run_dir / "replay.dat", args, checkpoint is not None), Player(learner, args.num_envs)
+    )
     global_step, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}
     if checkpoint is not None:
         global_step, training_seconds = checkpoint["global_step"], checkpoint["training_seconds"]

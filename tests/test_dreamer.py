@@ -490,6 +490,9 @@ def test_bfloat16_stays_near_float32(tmp_path):
         with learner.arithmetic():
             losses.append(method.world_model_loss(learner.model, data, 1_000)[0].item())
     assert losses[1] == pytest.approx(losses[0], rel=0.02)
+    wake(learner.behaviour)
+    learner.update(data)
+    assert all(parameter.grad.abs().sum() > 0 for parameter in learner.behaviour.actor.parameters())
 
 
 @pytest.mark.slow
@@ -528,6 +531,14 @@ def test_a_folder_of_another_run_is_refused(small_run, tmp_path):
     words = ["--seed 2 (was 1)", "must be as in"]
     done = run(*SMALL, "--run-dir", small_run, "--resume", "--seed", 2, cwd=tmp_path, code=2, script=SCRIPT)
     assert all(word in done.stderr for word in words) and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("change", [lambda path: path.unlink(), lambda path: path.write_bytes(path.read_bytes()[:99])])
+def test_a_run_does_not_go_on_without_its_replay(tmp_path, change):
+    run(*SMALL, "--run-dir", "run", "--stop-at", 1000, cwd=tmp_path, script=SCRIPT)
+    change(tmp_path / "run" / "replay.dat")
+    done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path, code=1, script=SCRIPT)
+    assert "replay.dat: missing or cut short" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_losses_that_explode_end_the_run(tmp_path):

@@ -49,9 +49,10 @@ def test_sizes_have_as_many_features_as_the_baseline(size):
     args, baseline = method.complete_args(method.Args(size=size)), dreamer_v2.complete_args(dreamer_v2.Args(size=size))
     features = args.deter_z + args.stoch_z + args.deter_w + args.stoch_w
     assert features == baseline.stoch * baseline.classes + baseline.deter
-    same = "encoder frame_side depth hidden_size head_size head_layers batch_size chunk_length starts horizon gamma"
+    same = "encoder frame_side depth hidden_size head_size head_layers batch_size chunk_length starts horizon gamma kl_warmup"
     for name in f"{same} actor_learning_rate critic_learning_rate ent_coef adam_eps train_frequency prefill".split():
         assert getattr(args, name) == getattr(baseline, name), name
+    assert args.kl_z_scale == args.kl_w_scale == baseline.kl_scale
     if size == "thesis":
         assert args.deter_z + args.stoch_z == args.deter_w + args.stoch_w == 812
 
@@ -135,7 +136,14 @@ def test_nothing_leaks_over_the_border_of_an_episode():
 
 def test_loss_is_the_sum_of_its_terms():
     """Eq. 3.3.5 and J_R by torch.distributions; m_t pairs with the action that followed step t."""
-    changes = {"kl_balance": 0.5, "kl_z_scale": 0.7, "kl_w_scale": 0.3, "budget_price": 0.0, "narrow_w": False}
+    changes = {
+        "kl_balance": 0.5,
+        "kl_warmup": 0,
+        "kl_z_scale": 0.7,
+        "kl_w_scale": 0.3,
+        "budget_price": 0.0,
+        "narrow_w": False,
+    }
     model, data = make_model(**changes), make_data([[1, 0, 0, 0, 0, 0], [1, 0, 1, 0, 0, 0], [1, 0, 0, 0, 0, 1]])
     data.terminals[1, 1] = 1
     torch.manual_seed(4)
@@ -199,6 +207,7 @@ def test_a_fixed_interval_reads_every_k_steps_from_an_episodes_first():
     assert ages == [1, 2, 0, 1, 2, 0, 1]
     loss, _, parts = method.world_model_loss(model, data, 0)
     assert torch.isfinite(loss) and parts["losses/kl_m"] == 0
+    assert parts["losses/read_rate"].item() == pytest.approx(2 / 9)  # of the steps that begin no episode
 
 
 # Runs
