@@ -11,8 +11,9 @@ episode reward (NER) of a run is where its score lies between the least and the 
 those of the runs at hand.
 
 Intervals are 95% percentiles of a bootstrap stratified by task. Resamples of n seeds have (n - 1) / n of the variance that
-they should have, half with 2 seeds, so the deviations from a task's mean are stretched accordingly. A claim is confirmed
-where the interval is above 0, contradicted where it is below, and open else, or where a task has a single seed.
+they should have, half with 2 seeds, so the deviations from a task's mean are stretched accordingly. Where a task has a single
+seed, tasks are resampled instead, which says nothing of other seeds. A claim is confirmed where the interval is above 0,
+contradicted where it is below, and open else, or where there is a single task.
 """
 
 import csv
@@ -272,6 +273,18 @@ def bootstrap(
     return float(statistic(*groups)), float(low), float(high)
 
 
+def bootstrap_tasks(statistic: Callable[..., np.ndarray], *groups: Scores) -> tuple[float, float, float]:
+    """The same by resampling the tasks, which all groups have in common; deviations are stretched for their number."""
+    rng, tasks = np.random.default_rng(0), list(groups[0])
+    middle, number = float(statistic(*groups)), len(tasks)
+    drawn = []
+    for chosen in rng.integers(number, size=(RESAMPLES, number)):
+        drawn.append(float(statistic(*({i: group[tasks[k]] for i, k in enumerate(chosen)} for group in groups))))
+    stretch = np.sqrt(number / max(1, number - 1))
+    low, high = middle + stretch * (np.percentile(drawn, (2.5, 97.5)) - middle)
+    return middle, float(low), float(high)
+
+
 def has_seeds(*groups: Scores) -> bool:
     """Whether each task of each group has two runs or more, so that there is an interval."""
     return all(len(values) > 1 for group in groups for values in group.values())
@@ -398,13 +411,14 @@ def tell(
     groups = tuple(common(*groups)) if all(groups) else ()
     if not groups or not groups[0]:
         return None
-    middle, low, high = bootstrap(statistic, *groups)
     seeds = sorted({len(values) for group in groups for values in group.values()})
-    counts = f"{len(groups[0])} task{'s' * (len(groups[0]) > 1)}, {' to '.join(map(str, sorted({seeds[0], seeds[-1]})))} seeds"
-    if seeds[0] < 2:
+    middle, low, high = (bootstrap if seeds[0] > 1 else bootstrap_tasks)(statistic, *groups)
+    counts = f"{len(groups[0])} task{'s' * (len(groups[0]) > 1)}, {' to '.join(map(str, sorted({seeds[0], seeds[-1]})))} seed{'s' * (seeds[-1] > 1)}"
+    if seeds[0] < 2 and len(groups[0]) < 2:
         return Finding(claim, theirs, f"{middle:+.{digits}f}, {counts}", "open")
     text = f"{middle:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}], {counts}"
-    return Finding(claim, theirs, text, verdict(low + margin, high + margin))
+    by = "" if seeds[0] > 1 else ", by tasks"
+    return Finding(claim, theirs, text, verdict(low + margin, high + margin) + by)
 
 
 def minus(a: Scores, b: Scores) -> np.ndarray:

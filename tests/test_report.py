@@ -162,14 +162,30 @@ def test_findings_of_a_study_that_is_as_the_thesis_says(rows):
     assert all(finding.published == "" for finding in report.findings(rows, "as tabulated", is_whole=False))
 
 
-def test_a_claim_that_is_wrong_is_contradicted_and_one_seed_leaves_it_open(rows):
+def test_interval_over_tasks_is_that_of_a_mean():
+    """Of eleven tasks' differences: the normal interval of their mean, by its standard error."""
+    rng = np.random.default_rng(0)
+    differences = rng.normal(0.3, 0.2, 11)
+    groups = [{str(k): np.array([value]) for k, value in enumerate(values)} for values in (differences, np.zeros(11))]
+    middle, low, high = report.bootstrap_tasks(report.minus, *groups)
+    half = 1.96 * differences.std(ddof=1) / 11**0.5
+    assert middle == pytest.approx(differences.mean())
+    assert (low, high) == pytest.approx((middle - half, middle + half), abs=0.02)
+
+
+def test_a_claim_that_is_wrong_is_contradicted_and_one_seed_says_by_what(rows):
     worse, better = (report.by_task(report.select(rows, "PPO", k), "as written") for k in (80, 10))
     finding = report.tell("80 above 10", "", report.minus, worse, better)
     assert finding.verdict == "contradicted" and "[-" in finding.measured
     assert report.tell("80 near 10", "", report.minus, worse, better, margin=1.0).verdict == "confirmed"
     single = {task: values[:1] for task, values in worse.items()}
     finding = report.tell("80 above 10", "", report.minus, single, better)
-    assert finding.verdict == "open" and "[" not in finding.measured and finding.measured.endswith("1 to 2 seeds")
+    assert finding.verdict == "contradicted, by tasks" and finding.measured.endswith("2 tasks, 1 to 2 seeds")
+    alone = {"Hopper-v2": single["Hopper-v2"]}
+    finding = report.tell("80 above 10", "", report.minus, alone, better)
+    assert (
+        finding.verdict == "open" and "[" not in finding.measured and finding.measured.endswith("1 task, 1 to 2 seeds")
+    )
     assert report.tell("none", "", report.minus, worse, {}) is None
     assert report.tell("other tasks", "", report.minus, worse, {"Ant-v2": np.ones(2)}) is None
 
