@@ -35,7 +35,7 @@ def shrunk(picture: np.ndarray, side: int) -> np.ndarray:
 @pytest.mark.parametrize("side", [64, 22])
 def test_frames_are_minigrids(size, side):
     """Within 2 grey levels of MiniGrid's picture in 2,500 states of each size, the agent beside and on the goal included."""
-    env, rng = gym.make(f"FourRooms{size}-v0", side=side).unwrapped, np.random.default_rng(0)
+    env, rng = method.FourRoomsEnv(size, side=side), np.random.default_rng(0)
     env.reset(seed=0)
     cells = len(env.games.maze.cells)
     worst = 0.0
@@ -53,7 +53,7 @@ def test_frames_are_minigrids(size, side):
 @pytest.mark.parametrize("size", SIZES)
 def test_maze_is_minigrids(size):
     """Walls and doors; from each pose each action leads where MiniGrid's step leads."""
-    env = gym.make(f"FourRooms{size}-v0").unwrapped
+    env = method.FourRoomsEnv(size)
     env.reset(seed=0)
     maze, middle = env.games.maze, size // 2
     doors = [(x, y) for x, y in maze.cells.tolist() if middle in (x, y)]
