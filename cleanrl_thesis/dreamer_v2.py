@@ -130,6 +130,8 @@ class Args:
     """chunks per batch"""
     chunk_length: int | None = None
     """steps of a chunk; episodes follow each other in it"""
+    rewarded_share: float | None = None
+    """share of the chunks that hold a reward, where there is one; all others are drawn from anywhere"""
     starts: int | None = None
     """states of a batch at which dreams start, at most"""
     horizon: int = 15
@@ -197,12 +199,28 @@ class Args:
 SIZES = {
     "xs": {"encoder": "tiles", "frame_side": 22, "depth": 16, "deter": 128, "stoch": 16, "classes": 32}
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
-    | {"batch_size": 24, "chunk_length": 10, "starts": 128, "gamma": 0.99, "image_scale": 0.25, "kl_scale": 1.0}
+    | {
+        "batch_size": 24,
+        "chunk_length": 10,
+        "rewarded_share": 0.1,
+        "starts": 128,
+        "gamma": 0.99,
+        "image_scale": 0.25,
+        "kl_scale": 1.0,
+    }
     | {"kl_warmup": 1_000, "reward_scale": 10.0, "tanh_reward": False, "model_learning_rate": 1e-3, "adam_eps": 1e-8}
     | {"actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3, "ent_coef": 3e-3},
     "thesis": {"encoder": "cnn", "frame_side": 64, "depth": 48, "deter": 600, "stoch": 32, "classes": 32}
     | {"hidden_size": 600, "head_size": 400, "head_layers": 4, "head_norm": False}
-    | {"batch_size": 16, "chunk_length": 50, "starts": 800, "gamma": 0.999, "image_scale": 1.0, "kl_scale": 0.1}
+    | {
+        "batch_size": 16,
+        "chunk_length": 50,
+        "rewarded_share": 0.0,
+        "starts": 800,
+        "gamma": 0.999,
+        "image_scale": 1.0,
+        "kl_scale": 0.1,
+    }
     | {"kl_warmup": 0, "reward_scale": 1.0, "tanh_reward": True, "model_learning_rate": 2e-4, "adam_eps": 1e-5}
     | {"actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4, "ent_coef": 1e-3},
 }
@@ -257,7 +275,7 @@ def complete_args(args: Args) -> Args:
         (rates, lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("max_grad_norm", lambda x: x > 0, "must be greater than 0"),
         (scales, lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
-        ("gamma gae_lambda kl_balance", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
+        ("gamma gae_lambda kl_balance rewarded_share", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("kl_warmup", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
         (
@@ -584,6 +602,14 @@ class Chunks(NamedTuple):
     terminals: torch.Tensor  # (T, B), 1 where the goal was reached
 
 
+def draw_from_rows(counts: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (number,) and places in them (number,), each of all the places (counts of each row) as likely as the other."""
+    ends = np.cumsum(counts)
+    drawn = torch.randint(int(ends[-1]), (number,)).numpy()
+    rows = np.searchsorted(ends, drawn, side="right")
+    return rows, drawn - (ends - counts)[rows]
+
+
 class Replay:
     """A row of records for each game, one episode after the other, in a file of the run's folder that is written in place."""
 
@@ -596,6 +622,7 @@ class Replay:
             raise RunError(f"{path}: missing or cut short; the run cannot go on without its replay")
         self.rows = np.memmap(path, RECORD, "r+" if goes_on else "w+", shape=(args.num_envs, capacity))
         self.lengths = np.zeros(args.num_envs, np.int64)
+        self.rewarded: list[list[int]] = [[] for _ in range(args.num_envs)]  # of each game, the records with a reward
 
     def add(self, games: np.ndarray, state: np.ndarray, **columns) -> None:
         """Append a record to each of the games (G,): states (G, 3) and columns of RECORD, (G,) or a number."""
@@ -603,8 +630,15 @@ class Replay:
         record["pose"], record["goal"] = 4 * state[:, 0] + state[:, 1], state[:, 2]
         for name, values in columns.items():
             record[name] = values
+        for game in games[record["reward"] > 0].tolist():
+            self.rewarded[game].append(int(self.lengths[game]))
         self.rows[games, self.lengths[games]] = record
         self.lengths[games] += 1
+
+    def go_on(self, lengths: np.ndarray) -> None:
+        """Take up the rows of a run that goes on, of these lengths; what was written after them is forgotten."""
+        self.lengths[:] = lengths
+        self.rewarded = [np.flatnonzero(row["reward"][:length] > 0).tolist() for row, length in zip(self.rows, lengths)]
 
     def example(self, device: torch.device) -> Chunks:
         """A batch of the right shapes, to compile with."""
@@ -612,13 +646,26 @@ class Replay:
         frames, zeros = torch.zeros(*shape, side, side, 3, dtype=torch.uint8), torch.zeros(shape)
         return Chunks(*(tensor.to(device) for tensor in (frames, zeros.long(), zeros, zeros, zeros)))
 
-    def sample(self, device: torch.device) -> Chunks:
-        """Chunks that begin anywhere, each place as likely as the other."""
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Games (B,) and records (B,) where chunks begin: anywhere, or for `--rewarded-share` of them so that they hold a reward."""
         args, places = self.args, self.lengths - self.args.chunk_length + 1
-        ends = np.cumsum(places)
-        drawn = torch.randint(int(ends[-1]), (args.batch_size,)).numpy()
-        games = np.searchsorted(ends, drawn, side="right")
-        begins = drawn - (ends - places)[games]
+        counts = np.array([len(rows) for rows in self.rewarded])
+        rewarded = round(args.rewarded_share * args.batch_size) if counts.any() else 0
+        games, begins = draw_from_rows(places, args.batch_size - rewarded)
+        if rewarded:
+            winners, numbers = draw_from_rows(counts, rewarded)
+            ends = np.array([self.rewarded[game][number] for game, number in zip(winners, numbers)])
+            begin = ends - torch.randint(args.chunk_length, (rewarded,)).numpy()
+            games, begins = (
+                np.concatenate([games, winners]),
+                np.concatenate([begins, begin.clip(0, places[winners] - 1)]),
+            )
+        return games, begins
+
+    def sample(self, device: torch.device) -> Chunks:
+        """A batch of chunks."""
+        args = self.args
+        games, begins = self.places()
         records = self.rows[games, begins + np.arange(args.chunk_length)[:, None]]  # (T, B)
         frames = self.painter.draw(records["pose"].ravel().astype(np.intp), records["goal"].ravel().astype(np.intp))
         actions, first, rewards, terminals = (
@@ -1186,15 +1233,20 @@ class Collector:
         self.replay.add(self.games, info["state"], first=1)
 
     def step(self, randomly: bool) -> list[tuple[int, float, int]]:
-        """One step of each game; returns (game, return, length) of the episodes that it ended."""
-        self.player.observe(self.obs, self.begins)
+        """One step of each game; returns (game, return, length) of the episodes that it ended.
+
+        Random play sees nothing: who takes over begins in the middle of an episode, as chunks do.
+        """
+        if not randomly:
+            self.player.observe(self.obs, self.begins)
         actions = self.player.act_randomly() if randomly else self.player.act()
         lengths = self.envs.games.steps + 1
         self.obs, rewards, terminated, truncated, infos = self.envs.step(actions)
-        self.begins = terminated | truncated
-        final = infos["final_info"] if self.begins.any() else infos
+        is_over = terminated | truncated
+        self.begins = is_over | randomly
+        final = infos["final_info"] if is_over.any() else infos
         self.replay.add(self.games, final["state"], action=actions, reward=rewards, terminal=terminated)
-        ended = np.flatnonzero(self.begins)
+        ended = np.flatnonzero(is_over)
         self.replay.add(ended, infos["state"][ended], first=1)
         return [(i, float(rewards[i]), int(lengths[i])) for i in ended.tolist()]
 
@@ -1218,7 +1270,7 @@ class Collector:
             array[:] = tensor.numpy().view(array.dtype)
         *belief, self.player.action = (part.to(self.player.learner.device) for part in state["belief"])
         self.player.state = type(self.player.state)(*belief)
-        self.replay.lengths[:] = state["lengths"].numpy()
+        self.replay.go_on(state["lengths"].numpy())
         self.begins = state["begins"].numpy().copy()
         self.obs = self.envs.draw()
 

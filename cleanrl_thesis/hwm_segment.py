@@ -108,6 +108,8 @@ class Args:
     """observation-action pairs to train on (section 3.4); the episodes after them are held out"""
     heldout_episodes: int = 400
     """episodes held out, at most"""
+    heldout_demos: Path | None = None
+    """folder whose episodes are held out, where those to train on are of another player; default: the rest of `--demos`"""
     frame_side: int = 22
     """pixels of the frames' side, to which the recorded ones are shrunk; two for each cell of the 11 × 11 maze"""
     red_scale: float = 5.0
@@ -267,46 +269,46 @@ def area_weights(length: int, side: int) -> np.ndarray:
     return np.maximum(covered, 0) * side / length
 
 
-def read_episode(path: Path, checksum: str, side: int) -> Episode:
+def read_episode(path: Path, checksum: str, side: int, flag: str) -> Episode:
     """One demonstration. Raises UsageError where it is not what the manifest says, or has no square images or rooms."""
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise UsageError(f"--demos {path}: cannot be read: {error.strerror}") from None
+        raise UsageError(f"{flag} {path}: cannot be read: {error.strerror}") from None
     same = hashlib.sha256(content).hexdigest() == checksum
-    require(same, "--demos", path, "its SHA-256 is not the manifest's, the file was changed or damaged")
+    require(same, flag, path, "its SHA-256 is not the manifest's, the file was changed or damaged")
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             names = ("observations", "actions", "states", "rooms")
             observations, actions, states, rooms = (arrays[name] for name in names)
     except (KeyError, ValueError, TypeError, zipfile.BadZipFile, EOFError, OSError) as error:
-        raise UsageError(f"--demos {path}: no demonstration with rooms: {first_line(error)}") from None
+        raise UsageError(f"{flag} {path}: no demonstration with rooms: {first_line(error)}") from None
     steps, shape = len(actions), observations.shape
     is_square = len(shape) == 4 and shape[1] == shape[2] >= side and shape[3] == 3 and observations.dtype == np.uint8
-    require(is_square, "--demos", path, f"observations must be square uint8 images of at least --frame-side {side}")
+    require(is_square, flag, path, f"observations must be square uint8 images of at least --frame-side {side}")
     fits = len(observations) == len(rooms) == steps + 1 and states.shape == (steps + 1, 3) and steps >= 1
-    require(fits, "--demos", path, f"must have T + 1 observations, states and rooms for T actions, T is {steps}")
+    require(fits, flag, path, f"must have T + 1 observations, states and rooms for T actions, T is {steps}")
     integers = all(np.issubdtype(array.dtype, np.integer) and (array >= 0).all() for array in (actions, states, rooms))
-    require(bool(integers), "--demos", path, "actions, states and rooms must be whole numbers from 0")
+    require(bool(integers), flag, path, "actions, states and rooms must be whole numbers from 0")
     weights = area_weights(shape[1], side).astype(np.float32)
     frames = np.einsum("ia,tabc,jb->tijc", weights, observations[:-1].astype(np.float32), weights, optimize=True)
     return Episode(frames, actions.astype(np.int64), states[:-1].astype(np.int64), rooms[:-1].astype(np.int64))
 
 
-def read_demonstrations(folder: Path, side: int) -> tuple[list[Episode], str]:
+def read_demonstrations(folder: Path, side: int, flag: str = "--demos") -> tuple[list[Episode], str]:
     """All episodes of a folder, in the order of their names, and the environment's id. Raises UsageError."""
     try:
         manifest = json.loads((folder / "manifest.json").read_text())
         files, recorded, version = dict(manifest["files"]), str(manifest["env_id"]), manifest["version"]
     except (OSError, ValueError, KeyError, TypeError):
-        raise UsageError(f"--demos {folder}: holds no demonstrations, it has no readable manifest.json") from None
-    require(version == 1, "--demos", folder, f"its manifest is of version {version}, this script reads version 1")
-    require(bool(files), "--demos", folder, "holds no demonstrations, its manifest names no file")
-    return [read_episode(folder / name, checksum, side) for name, checksum in sorted(files.items())], recorded
+        raise UsageError(f"{flag} {folder}: holds no demonstrations, it has no readable manifest.json") from None
+    require(version == 1, flag, folder, f"its manifest is of version {version}, this script reads version 1")
+    require(bool(files), flag, folder, "holds no demonstrations, its manifest names no file")
+    return [read_episode(folder / name, checksum, side, flag) for name, checksum in sorted(files.items())], recorded
 
 
 def split_episodes(episodes: list[Episode], args: Args) -> tuple[list[Episode], list[Episode]]:
-    """The first episodes with `--train-pairs` steps, and those held out. Raises UsageError where there are too few."""
+    """The first episodes with `--train-pairs` steps, and those held out after them. Raises UsageError where there are too few."""
     ends = np.cumsum([len(episode.actions) for episode in episodes])
     first = int(np.searchsorted(ends, args.train_pairs)) + 1
     allowed = f"must leave at least one episode to hold out; the demonstrations have {ends[-1]} pairs"
@@ -314,6 +316,26 @@ def split_episodes(episodes: list[Episode], args: Args) -> tuple[list[Episode], 
     enough = args.chunk_length < ends[first - 1]
     require(enough, "--chunk-length", args.chunk_length, f"must be less than the {ends[first - 1]} steps to train on")
     return episodes[:first], episodes[first : first + args.heldout_episodes]
+
+
+class Split(NamedTuple):
+    """Which episodes serve for what."""
+
+    training: list[Episode]
+    probed: list[Episode]  # from which the probes learn
+    heldout: list[Episode]
+
+
+def read_split(args: Args) -> tuple[Split, str]:
+    """The episodes of `--demos` and `--heldout-demos`, and the environment's id. Raises UsageError."""
+    demonstrations, env_id = read_demonstrations(args.demos, args.frame_side)
+    training, heldout = split_episodes(demonstrations, args)
+    probed = training
+    if args.heldout_demos is not None:
+        others, other_id = read_demonstrations(args.heldout_demos, args.frame_side, "--heldout-demos")
+        require(other_id == env_id, "--heldout-demos", args.heldout_demos, f"must be of {env_id}, is of {other_id}")
+        probed, heldout = split_episodes(others, args)
+    return Split(training, probed[:400], heldout), env_id
 
 
 class Normalizer(NamedTuple):
@@ -808,7 +830,7 @@ def compile_step(model: HWM, data: Sequence, args: Args) -> bool:
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "hwm_segment 1"
-FINISH = ("save_model", "heldout_episodes")
+FINISH = ("save_model", "heldout_episodes", "heldout_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", "demos", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
 
@@ -1023,11 +1045,9 @@ def probes(train: Segmented, test: Segmented, train_episodes: list[Episode], tes
     return accuracy
 
 
-def evaluate(
-    model: HWM, episodes: tuple[list[Episode], list[Episode]], normalizer: Normalizer, args: Args, device
-) -> dict:
+def evaluate(model: HWM, episodes: Split, normalizer: Normalizer, args: Args, device) -> dict:
     """All measures on the held-out episodes: m from p (section 3.5.1), drawn from p, and from q; and their floors."""
-    known, heldout = episodes[0][:400], episodes[1]
+    heldout = episodes.heldout
     rooms, states = [episode.rooms for episode in heldout], [episode.states for episode in heldout]
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
@@ -1043,7 +1063,9 @@ def evaluate(
         result["mutual_information_z_room"] = normalised_mutual_information(
             k_means(standard, 8, rng), np.concatenate(rooms)
         )
-        result["probes"] = probes(segment(model, known, normalizer, mode, device), made, known, heldout)
+        result["probes"] = probes(
+            segment(model, episodes.probed, normalizer, mode, device), made, episodes.probed, heldout
+        )
         results[mode] = result
     constant = np.concatenate([episode.frames for episode in heldout]) / 255 - normalizer.mean
     about = {
@@ -1128,11 +1150,10 @@ def fingerprint(data: Sequence) -> str:
 def main(args: Args) -> int:
     """Train, measure and write everything into the run's folder. Returns the exit code."""
     args = complete_args(args)
-    demonstrations, args.env_id = read_demonstrations(args.demos, args.frame_side)
-    episodes = split_episodes(demonstrations, args)
-    mean = np.concatenate([episode.frames for episode in episodes[0]]).mean(0) / 255
+    episodes, args.env_id = read_split(args)
+    mean = np.concatenate([episode.frames for episode in episodes.training]).mean(0) / 255
     normalizer = Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32))
-    data = in_a_row(episodes[0], normalizer)
+    data = in_a_row(episodes.training, normalizer)
     data_id, num_actions = fingerprint(data), int(data.actions.max()) + 1
     run_dir, checkpoint = open_run_dir(args)
     last_update = min(args.attempts * args.total_updates, args.stop_at)
@@ -1186,9 +1207,9 @@ def main(args: Args) -> int:
         update += 1
         progress.update(1)
         if update % args.total_updates == 0:
-            attempts.append(
-                {"objective": objective(model, data), **held_out_scores(model, episodes[1], normalizer, device)}
-            )
+            with torch.random.fork_rng():  # so that what is held out changes nothing
+                scores = held_out_scores(model, episodes.heldout, normalizer, device)
+            attempts.append({"objective": objective(model, data), **scores})
             if best is None or attempts[-1]["objective"] > max(each["objective"] for each in attempts[:-1]):
                 best = {name: value.clone() for name, value in model.state_dict().items()}
         crossed = update % args.checkpoint_interval == 0
@@ -1236,7 +1257,7 @@ def main(args: Args) -> int:
 def finish_run(
     model: HWM,
     attempts: list,
-    episodes,
+    episodes: Split,
     normalizer: Normalizer,
     args: Args,
     run_dir: Path,
@@ -1247,7 +1268,7 @@ def finish_run(
     """Measure, draw Fig. 3.4, save what was asked for, and write `result.json` last."""
     segmentation = {**evaluate(model, episodes, normalizer, args, device), "attempts": attempts}
     write_json(run_dir / "segmentation.json", segmentation)
-    draw_figure(model, longest_way(episodes[1]), normalizer, device, run_dir / "figure_3_4.png")
+    draw_figure(model, longest_way(episodes.heldout), normalizer, device, run_dir / "figure_3_4.png")
     if args.save_model:
         content = safetensors.torch.save(model.state_dict(), {"args": json.dumps(arguments(args))})
         write_whole(run_dir / "model.safetensors", content)

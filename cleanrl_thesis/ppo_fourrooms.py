@@ -101,6 +101,8 @@ class Args:
     """episodes of the trained agent to write into `demos/`, one .npz each and a manifest; 2,300 of a player stopped at 1,100,000 steps are 34,000 pairs"""
     demo_mode: Literal["sampled", "greedy"] = "sampled"
     """how the agent acts in `--save-demos`"""
+    demo_noise: float = 0.0
+    """share of the actions of `--save-demos` that are drawn at random instead: the agent wanders; written into `demos_noise_{demo_noise}/`"""
     eval_episodes: int = 2_000
     """episodes of the evaluation at the end, with the most probable action"""
     run_dir: Path | None = None
@@ -200,6 +202,7 @@ def complete_args(args: Args) -> Args:
         ("gamma gae_lambda", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
         ("save_demos", lambda x: x >= 0, "must be at least 0"),
+        ("demo_noise", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
     ):
         for name in names.split():
             require(holds(getattr(args, name)), f"--{name.replace('_', '-')}", getattr(args, name), allowed)
@@ -755,7 +758,7 @@ def update_agent(update: Update, batch: Batch, args: Args) -> dict[str, float]:
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "ppo_fourrooms 1"
-FINISH = ("eval_episodes", "capture_video", "save_model", "save_demos", "demo_mode")
+FINISH = ("eval_episodes", "capture_video", "save_model", "save_demos", "demo_mode", "demo_noise")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
 
@@ -918,14 +921,14 @@ class StopSignal:
 # Evaluation
 # ---------------------------------------------------------------------------------------------------------------------
 @torch.no_grad()
-def play(agent: Agent, args: Args, seeds: list[int], mode: str) -> list[dict[str, np.ndarray]]:
-    """One episode for each seed, side by side, with sampled or greedy actions.
+def play(agent: Agent, args: Args, seeds: list[int], mode: str, noise: float = 0.0) -> list[dict[str, np.ndarray]]:
+    """One episode for each seed, side by side, with sampled or greedy actions, or with the chance `noise` any action.
 
     Returns for each `states` (T + 1, 3): cell, direction, goal cell; `rooms` (T + 1,), `actions` (T,), `rewards` (T,),
     `terminated`, `truncated` and `seed`.
     """
     device = next(agent.parameters()).device
-    generator = torch.Generator().manual_seed(args.seed)
+    generator, rng = torch.Generator().manual_seed(args.seed), np.random.default_rng(args.seed)
     envs = FourRoomsVectorEnv(len(seeds), ROOM_SIZES[args.env_id], args.frame_side)
     obs, info = envs.reset(seed=seeds)
     states, rooms, actions, rewards, ends = [info["state"]], [info["room"]], [], [], []
@@ -934,6 +937,9 @@ def play(agent: Agent, args: Args, seeds: list[int], mode: str) -> list[dict[str
         logits = torch.cat([agent(part.to(device))[0] for part in parts])
         chosen = sample_actions(logits, generator) if mode == "sampled" else logits.argmax(1)
         actions.append(chosen.cpu().numpy())
+        if noise > 0:
+            is_random = rng.random(len(seeds)) < noise
+            actions[-1] = np.where(is_random, rng.integers(logits.shape[1], size=len(seeds)), actions[-1])
         obs, reward, terminated, truncated, info = envs.step(actions[-1])
         final = info.get("final_info", info)
         states.append(final["state"])
@@ -1016,16 +1022,17 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 
 
 def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
-    """Write `--save-demos` episodes into `demos/`, with the frames of the task, (T + 1, 64, 64, 3) uint8."""
+    """Write `--save-demos` episodes into `demos/` or `demos_noise_.../`, with the frames of the task, (T + 1, 64, 64, 3) uint8."""
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
     pictures = painter(ROOM_SIZES[args.env_id], 64)
     episodes = (
         {"observations": pictures.draw(4 * episode["states"][:, 0] + episode["states"][:, 1], episode["states"][:, 2])}
         | episode
-        for episode in play(agent, args, seeds, args.demo_mode)
+        for episode in play(agent, args, seeds, args.demo_mode, args.demo_noise)
     )
-    about = {"env_id": args.env_id, "player": args.exp_name, "mode": args.demo_mode}
-    write_demonstrations(run_dir / "demos", episodes, about)
+    about = {"env_id": args.env_id, "player": args.exp_name, "mode": args.demo_mode, "noise": args.demo_noise}
+    folder = f"demos_noise_{args.demo_noise:g}" if args.demo_noise else "demos"
+    write_demonstrations(run_dir / folder, episodes, about)
 
 
 def write_demonstrations(folder: Path, episodes: Iterable[dict[str, np.ndarray]], about: dict) -> None:

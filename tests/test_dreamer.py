@@ -106,6 +106,45 @@ def test_chunks_are_pieces_of_the_rows(tmp_path):
     assert inner > 0 and abs(np.mean(places) - 0.5) < 0.05 and min(places) < 0.02 and max(places) > 0.98
 
 
+def test_some_chunks_hold_a_reward(tmp_path):
+    """The asked-for share of a batch: every reward as likely, anywhere in its chunk; the same after going on."""
+    learner = make_learner(batch_size=8, rewarded_share=0.25)
+    replay = make_collector(tmp_path, learner, steps=0).replay
+    for row in replay.rows:
+        row["reward"], row["pose"] = 0, np.arange(replay.rows.shape[1])
+    winners = [(0, 0), (0, 97), (1, 5), (1, 50), (1, 99)]  # at both ends, a chunk cannot hold it anywhere
+    replay.rewarded = [[] for _ in replay.lengths]
+    for game, t in winners:
+        replay.rows[game, t]["reward"] = 1
+    replay.go_on(np.array([100] * len(replay.lengths)))
+    assert [(game, t) for game, found in enumerate(replay.rewarded) for t in found] == winners
+    counts, offsets = dict.fromkeys(winners, 0), []
+    for _ in range(1_000):
+        for game, begin in list(zip(*replay.places()))[-2:]:
+            assert 0 <= begin <= 94
+            held = [(g, t) for g, t in winners if g == game and begin <= t < begin + 6]
+            counts[held[0]] += len(held) == 1
+            offsets += [50 - begin] if held == [(1, 50)] else []
+    assert sum(counts.values()) == 2_000 and np.allclose(list(counts.values()), 400, atol=60)
+    assert np.allclose(np.bincount(offsets, minlength=6) / len(offsets), 1 / 6, atol=0.06)
+
+
+def test_rewards_are_known_where_they_are_added(tmp_path):
+    replay = make_collector(tmp_path, make_learner(total_timesteps=10_000), steps=400).replay
+    known = [list(found) for found in replay.rewarded]
+    assert sum(map(len, known)) > 0
+    replay.go_on(replay.lengths.copy())
+    assert replay.rewarded == known
+
+
+def test_random_play_leaves_no_belief(tmp_path):
+    """Who takes over begins as a chunk does, in the middle of an episode."""
+    collector = make_collector(tmp_path, make_learner(), steps=7)
+    assert collector.begins.all() and not collector.replay.rows["first"][:, 7].any()
+    collector.step(randomly=False)
+    assert not collector.begins.any()
+
+
 # The model
 def test_tiles_are_squares_of_two_by_two_pixels():
     """The encoder is a convolution of stride 2; the decoder puts each tile where the encoder has it."""

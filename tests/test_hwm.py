@@ -446,9 +446,9 @@ def test_the_attempt_with_the_greatest_objective_is_kept(demos, small_run):
     assert len(values) == 2 and values[0] != values[1]
     args = method.parse_args([*map(str, SMALL), "--demos", str(demos)])
     args = method.complete_args(args)
-    episodes = method.split_episodes(method.read_demonstrations(demos, args.frame_side)[0], args)
-    mean = np.concatenate([episode.frames for episode in episodes[0]]).mean(0) / 255
-    data = method.in_a_row(episodes[0], method.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32)))
+    training = method.read_split(args)[0].training
+    mean = np.concatenate([episode.frames for episode in training]).mean(0) / 255
+    data = method.in_a_row(training, method.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32)))
     model = method.HWM(args, data.frames.shape[1], int(data.actions.max()) + 1)
     model.load_state_dict(load_file(small_run / "model.safetensors"))
     assert method.objective(model, data) == pytest.approx(max(values), rel=1e-5)
@@ -474,6 +474,26 @@ def test_killed_runs_end_with_the_same_bytes(demos, tmp_path, seed):
     kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 15, seed, SCRIPT)
     run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert_same_states(tmp_path / "whole", tmp_path / "run")
+
+
+def test_heldout_episodes_of_another_folder(demos, small_run, tmp_path):
+    """The same training; measured on the other folder's episodes after its first `--train-pairs`, probes from those before."""
+    other, task = tmp_path / "other", rooms.maze(11)
+    episodes = [search_episode(task, rooms.fewest_steps(task), np.random.default_rng(7)) for _ in range(60)]
+    rooms.write_demonstrations(other, episodes, {"env_id": "FourRooms11-v0"})
+    args = make_args(demos=demos, heldout_demos=other, train_pairs=300, heldout_episodes=2)
+    split, plain = method.read_split(args)[0], method.read_split(make_args(demos=demos, train_pairs=300))[0]
+    assert np.array_equal(split.training[3].frames, plain.training[3].frames)
+    others = method.read_demonstrations(other, args.frame_side)[0]
+    assert np.array_equal(split.probed[3].frames, others[3].frames) and len(split.heldout) == 2
+    assert np.array_equal(split.heldout[1].frames, others[len(split.probed) + 1].frames)
+    flags = [*SMALL, "--demos", demos, "--heldout-demos", other, "--save-model", "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=SCRIPT)
+    models = [(folder / "model.safetensors").read_bytes()[-1000:] for folder in (small_run, tmp_path / "run")]
+    assert models[0] == models[1]
+    rooms.write_demonstrations(other, episodes, {"env_id": "FourRooms19-v0"})
+    done = run(*flags, "--resume", cwd=tmp_path, code=2, script=SCRIPT)
+    assert "--heldout-demos" in done.stderr and "must be of FourRooms11-v0" in done.stderr
 
 
 def test_other_demonstrations_are_refused_on_resume(demos, small_run, tmp_path):

@@ -140,6 +140,18 @@ def test_demonstrations_are_whole_and_can_be_played_again(small_run):
         assert (terminated, truncated) == (episode["terminated"], episode["truncated"])
 
 
+def test_demonstrations_with_noise(small_run, tmp_path):
+    """Of a finished run, beside those without noise: all actions random, so that each comes in a third of the steps."""
+    shutil.copytree(small_run, tmp_path / "run")
+    flags = ["--save-model", "--save-demos", 40, "--demo-noise", 1, "--resume"]
+    run(*SMALL, *flags, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    manifest = json.loads((tmp_path / "run" / "demos_noise_1" / "manifest.json").read_text())
+    assert manifest["noise"] == 1 and len(manifest["files"]) == 40 and (tmp_path / "run" / "demos").is_dir()
+    actions = [np.load(tmp_path / "run" / "demos_noise_1" / name)["actions"] for name in manifest["files"]]
+    shares = np.bincount(np.concatenate(actions), minlength=3) / sum(map(len, actions))
+    assert abs(shares - 1 / 3).max() < 0.05
+
+
 def test_same_seed_same_bytes_and_another_seed_others(small_run, tmp_path):
     run(*SMALL, "--run-dir", "again", cwd=tmp_path, script=SCRIPT)
     assert_same_states(small_run, tmp_path / "again")

@@ -75,6 +75,7 @@ BAD_ROOMS = [
     (["--num-envs", 1, "--num-steps", 1, "--num-minibatches", 1], ["--num-envs", "1", "at least 2"]),
     (["--total-timesteps", 100], ["--total-timesteps", "100", "16384"]),
     (["--demo-mode", "best"], ["--demo-mode", "best"]),
+    (["--demo-noise", 1.5], ["--demo-noise", "1.5", "between 0 and 1"]),
     (["--ent-coef", "-1"], ["--ent-coef", "-1.0"]),
     (["--gamma", "nan"], ["--gamma", "nan"]),
     (["--eval-episodes", 0], ["--eval-episodes", "0"]),
