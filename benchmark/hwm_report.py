@@ -24,6 +24,7 @@ RUNGS = {
     "price": "(d) a price for each read",
     "narrow": "(e) narrow w, reset, budget",
     "no_budget": "(e) without the budget",
+    "wander": "(f) trained on a player who wanders",
 }
 MEASURES = {
     "f1_8_labels_0": "F1, 8 labels, exact",

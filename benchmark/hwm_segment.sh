@@ -6,13 +6,14 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
-RUNGS=${RUNGS:-narrow faithful reset kl_w price no_budget} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
+RUNGS=${RUNGS:-narrow faithful reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
 mkdir -p "$RUNS"
 "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-demos 2300 --save-model --run-dir "$PLAYER" --resume
 # rung (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of it
-FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
+FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
 FAITHFUL+=" --stoch-w 16 --kl-m-scale 1 --max-segments 10"
 for rung in $RUNGS; do
+  demos=$PLAYER/demos
   case $rung in
     narrow) flags="" ;;                                # (e) the default
     no_budget) flags="--budget-price 0" ;;             # (e) without the budget
@@ -20,13 +21,20 @@ for rung in $RUNGS; do
     kl_w) flags="$FAITHFUL --kl-w-scale 1" ;;          # (b) a larger weight of KL_w
     reset) flags="$FAITHFUL --w-reset" ;;              # (c) w starts anew where z is read
     price) flags="$FAITHFUL --read-price 10" ;;        # (d) a price for each read
+    wander)                                            # (f) trained on a player who wanders, measured on the other's episodes
+      "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-demos 500 --demo-noise 0.8 --save-model \
+        --run-dir "$PLAYER" --resume >&2
+      demos=$PLAYER/demos_noise_0.8
+      flags="--heldout-demos $PLAYER/demos --budget 0.03 --narrow-std 0.3 --total-updates 3000 --chunk-length 64"
+      flags+=" --batch-size 8 --max-segment-length 0"
+      ;;
     *)
-      echo "RUNGS=$RUNGS: must be of narrow, no_budget, faithful, kl_w, reset and price" >&2
+      echo "RUNGS=$RUNGS: must be of narrow, no_budget, faithful, kl_w, reset, price and wander" >&2
       exit 2
       ;;
   esac
   for seed in $SEEDS; do
-    echo --demos "$PLAYER/demos" --seed "$seed" --run-dir "$RUNS/${rung}_seed$seed" $flags
+    echo --demos "$demos" --seed "$seed" --run-dir "$RUNS/${rung}_seed$seed" $flags
   done
 done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/hwm_segment.py --save-model --resume
 "$PYTHON" benchmark/hwm_report.py --runs "$RUNS"
