@@ -8,7 +8,11 @@ cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
 RUNGS=${RUNGS:-narrow faithful reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
 mkdir -p "$RUNS"
-"$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-demos 2300 --save-model --run-dir "$PLAYER" --resume
+record() {  # DEMOS flags...: episodes of the player stopped at 1,100,000 steps, unless they are there
+  [ -e "$PLAYER/$1/manifest.json" ] || "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --compile --save-model \
+    --run-dir "$PLAYER" --resume "${@:2}" >&2
+}
+record demos --save-demos 2300
 # rung (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of it
 FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
 FAITHFUL+=" --stoch-w 16 --kl-m-scale 1 --max-segments 10"
@@ -22,8 +26,7 @@ for rung in $RUNGS; do
     reset) flags="$FAITHFUL --w-reset" ;;              # (c) w starts anew where z is read
     price) flags="$FAITHFUL --read-price 10" ;;        # (d) a price for each read
     wander)                                            # (f) trained on a player who wanders, measured on the other's episodes
-      "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-demos 500 --demo-noise 0.8 --save-model \
-        --run-dir "$PLAYER" --resume >&2
+      record demos_noise_0.8 --save-demos 500 --demo-noise 0.8
       demos=$PLAYER/demos_noise_0.8
       flags="--heldout-demos $PLAYER/demos --budget 0.03 --narrow-std 0.3 --total-updates 3000 --chunk-length 64"
       flags+=" --batch-size 8 --max-segment-length 0"
