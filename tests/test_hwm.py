@@ -306,7 +306,7 @@ def test_the_decoder_sees_what_it_is_told_to(part):
 
 
 def test_narrow_w():
-    made = make_model(narrow_w=True).infer(make_data([[30]]), "train")
+    made = make_model(narrow_w=True, narrow_std=0.3).infer(make_data([[30]]), "train")
     assert (made.q_w.mean.abs() <= 1).all() and (made.q_w.std == 0.3).all()
 
 
