@@ -30,7 +30,8 @@ HWM_AGENTS = {
     "SIZES": "sizes of the HWM",
     "world_model_loss": "J_HWM",
     "Belief": "counts the steps of a segment",
-    "HWM": "filters and dreams, by the actions before the frames; heads for reward and discount",
+    "HWM": "filters and dreams, by the actions before the frames; heads for reward and discount; categorical v and y",
+    "Inference": "v and y may be categorical",
     "mlp": "ELU, torch's own initialisation",
     "schedule": "of updates that go on as long as the agent plays",
 }

@@ -15,11 +15,21 @@ from cleanrl_thesis import hwm_dreamer as method
 
 SCRIPT = ROOT / "cleanrl_thesis" / "hwm_dreamer.py"
 CPU = torch.device("cpu")
-TINY = {"deter_z": 5, "stoch_z": 3, "deter_w": 6, "stoch_w": 2, "hidden_size": 16, "head_size": 16, "depth": 2}
+TINY = {
+    "deter_z": 5,
+    "stoch_z": 3,
+    "deter_w": 6,
+    "stoch_w": 2,
+    "classes": 4,
+    "hidden_size": 16,
+    "head_size": 16,
+    "depth": 2,
+}
 TINY |= {"batch_size": 3, "chunk_length": 6, "starts": 8, "horizon": 4}
 FLAGS = [part for name, value in TINY.items() for part in (f"--{name.replace('_', '-')}", value)]
 SMALL = [*FLAGS, "--total-timesteps", 1500, "--prefill", 500, "--train-frequency", 20, "--checkpoint-interval", 500]
 SMALL += ["--eval-episodes", 4, "--budget-updates", 40]
+PARTS = (5, 12, 6, 8)  # sizes of c, v, h and y
 
 
 def make_args(**changes) -> method.Args:
@@ -47,9 +57,10 @@ def one_hot(actions: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("size", ["xs", "s", "m", "thesis"])
 def test_sizes_have_as_many_features_as_the_baseline(size):
     args, baseline = method.complete_args(method.Args(size=size)), dreamer_v2.complete_args(dreamer_v2.Args(size=size))
-    features = args.deter_z + args.stoch_z + args.deter_w + args.stoch_w
+    features = args.deter_z + args.deter_w + (args.stoch_z + args.stoch_w) * args.classes
     assert features == baseline.stoch * baseline.classes + baseline.deter
     same = "encoder frame_side depth hidden_size head_size head_layers batch_size chunk_length starts horizon gamma kl_warmup"
+    same += " entropy_scale model_learning_rate"
     for name in f"{same} actor_learning_rate critic_learning_rate ent_coef adam_eps train_frequency prefill".split():
         assert getattr(args, name) == getattr(baseline, name), name
     assert args.kl_z_scale == args.kl_w_scale == baseline.kl_scale
@@ -59,13 +70,17 @@ def test_sizes_have_as_many_features_as_the_baseline(size):
 
 def test_z_is_copied_and_read_where_m_says():
     """COPY leaves c and v as they are, UPDATE changes both; w changes with each step; `age` counts."""
-    model = make_model()
-    state = method.Belief(*(torch.randn(2, size) for size in (5, 3, 6, 2)), torch.tensor([[3.0], [4.0]]))
+    model = make_model(w_reset=True)
+    state = method.Belief(*(torch.randn(2, size) for size in PARTS), torch.tensor([[3.0], [4.0]]))
     read = torch.tensor([[0.0], [1.0]])
     after, _, _ = model.step(state, one_hot(torch.tensor([0, 2])), read, torch.randn(2, 16), model.noise(2))
     assert torch.equal(after.c[0], state.c[0]) and torch.equal(after.v[0], state.v[0])
     assert not torch.equal(after.c[1], state.c[1]) and not torch.equal(after.v[1], state.v[1])
-    assert not torch.isclose(after.h, state.h).any() and after.age.tolist() == [[4.0], [0.0]]
+    assert (
+        not torch.isclose(after.h, state.h).any()
+        and not torch.equal(after.y, state.y)
+        and after.age.tolist() == [[4.0], [0.0]]
+    )
     expected = torch.tanh(model.w_start(torch.cat([after.c, after.v], -1)))[1]
     assert torch.allclose(after.h[1], expected)  # w starts anew from z
     literal = make_model(w_reset=False)
@@ -78,26 +93,40 @@ def test_the_dream_reads_where_the_prior_says(logit):
     model = make_model()
     torch.nn.init.zeros_(model.prior_m[-1].weight)
     torch.nn.init.constant_(model.prior_m[-1].bias, logit)
-    state = method.Belief(*(torch.randn(4, size) for size in (5, 3, 6, 2)), torch.zeros(4, 1))
+    state = method.Belief(*(torch.randn(4, size) for size in PARTS), torch.zeros(4, 1))
     after = model.imagine_step(state, one_hot(torch.tensor([0, 1, 2, 2])), model.noise(4))
     assert torch.equal(after.c, state.c) == torch.equal(after.v, state.v) == (logit < 0)
     assert (after.age == (1 if logit < 0 else 0)).all()
 
 
-def test_the_dream_draws_m_with_its_probability_and_v_and_y_from_their_priors():
-    model = make_model()
+@pytest.mark.parametrize("classes", [1, 4])
+def test_the_dream_draws_m_with_its_probability_and_v_and_y_from_their_priors(classes):
+    model = make_model(classes=classes)
     torch.nn.init.zeros_(model.prior_m[-1].weight)
     torch.nn.init.constant_(model.prior_m[-1].bias, np.log(0.3 / 0.7))
-    state = method.Belief(*(torch.randn(1, size).expand(20_000, size) for size in (5, 3, 6, 2)), torch.zeros(20_000, 1))
+    state = method.Belief(*(torch.randn(1, size).expand(20_000, size) for size in model.sizes), torch.zeros(20_000, 1))
     after = model.imagine_step(state, one_hot(torch.zeros(20_000, dtype=torch.int64)), model.noise(20_000))
     read = after.age[:, 0] == 0
     assert read.float().mean().item() == pytest.approx(0.3, abs=0.015)
-    p_z = model.distribution(model.prior_z, after.c[read][:1])
-    assert torch.allclose(after.v[read].mean(0), p_z.mean[0], atol=0.02)
-    assert torch.allclose(after.v[read].std(0), p_z.std[0], atol=0.02)
-    p_w = model.distribution(model.prior_w, after.h[~read][:1])
-    assert torch.allclose(after.y[~read].mean(0), p_w.mean[0], atol=0.03)
-    assert torch.allclose(after.y[~read].std(0), p_w.std[0], atol=0.03)
+    for drawn, prior in (
+        (after.v[read], model.prior_z(after.c[read][:1])),
+        (after.y[~read], model.prior_w(after.h[~read][:1])),
+    ):
+        if classes == 1:
+            mean, std = prior.mean[0], prior.std[0]
+        else:
+            mean = prior.logits.softmax(-1).flatten()
+            std = (mean * (1 - mean)).sqrt()
+        assert torch.allclose(drawn.mean(0), mean, atol=0.03) and torch.allclose(drawn.std(0), std, atol=0.03)
+
+
+def test_normal_draws_and_their_divergence():
+    torch.manual_seed(0)
+    q, p = (method.Normal(torch.randn(5, 3), torch.rand(5, 3) + 0.1) for _ in range(2))
+    assert torch.equal(method.draw(q, torch.ones(5, 3)), q.mean + q.std)
+    normal = torch.distributions.Normal
+    expected = torch.distributions.kl_divergence(normal(*q), normal(*p)).sum(-1)
+    assert torch.allclose(method.kl_divergence(q, p), expected, atol=1e-4)
 
 
 def test_acting_is_the_inference_of_training_step_by_step():
@@ -134,35 +163,41 @@ def test_nothing_leaks_over_the_border_of_an_episode():
         assert torch.equal(before[3:], after[3:])
 
 
-def test_loss_is_the_sum_of_its_terms():
+@pytest.mark.parametrize("classes", [1, 4])
+def test_loss_is_the_sum_of_its_terms(classes):
     """Eq. 3.3.5 and J_R by torch.distributions; m_t pairs with the action that followed step t."""
-    changes = {
-        "kl_balance": 0.5,
-        "kl_warmup": 0,
-        "kl_z_scale": 0.7,
-        "kl_w_scale": 0.3,
-        "budget_price": 0.0,
-        "narrow_w": False,
-    }
+    changes = {"kl_balance": 0.5, "kl_warmup": 1_000, "kl_z_scale": 0.7, "kl_w_scale": 0.3, "budget_price": 0.0}
+    changes |= {"classes": classes, "budget_updates": 1}
     model, data = make_model(**changes), make_data([[1, 0, 0, 0, 0, 0], [1, 0, 1, 0, 0, 0], [1, 0, 0, 0, 0, 1]])
     data.terminals[1, 1] = 1
     torch.manual_seed(4)
-    loss, belief, parts = method.world_model_loss(model, data, 10**6)
+    loss, belief, parts = method.world_model_loss(model, data, 499)
     torch.manual_seed(4)
     frames = model.normalize(data.frames)
     embed = model.embedding(frames.flatten(0, 1)).unflatten(0, (6, 3))
     made = model.observe(embed, one_hot(data.actions), data.first, model.args.temperature)
-    normal, bernoulli, kl = torch.distributions.Normal, torch.distributions.Bernoulli, torch.distributions.kl_divergence
+    bernoulli, kl = torch.distributions.Bernoulli, torch.distributions.kl_divergence
+
+    def of(given):
+        if classes == 1:
+            return torch.distributions.Normal(*given)
+        return torch.distributions.OneHotCategorical(logits=given.logits)
+
+    def at(many, t, b):
+        return of(type(many)(*(part[t, b] for part in many)))
+
     total = 0.0
     for t in range(6):
         for b in range(3):
             here = method.Belief(*(part[t, b][None] for part in made.belief))
             total += 0.25 * 0.5 * (model.decode(here)[0] - frames[t, b]).square().sum()
-            if made.reads[t, b]:
-                q, p = method.Normal(*(part[t, b] for part in made.q_z)), model.prior_z(here.c)
-                total += 0.7 * kl(normal(*q), normal(p.mean[0], p.std[0])).sum()
-            q, p = method.Normal(*(part[t, b] for part in made.q_w)), model.prior_w(here.h)
-            total += 0.3 * kl(normal(*q), normal(p.mean[0], p.std[0])).sum()
+            q_z, q_w = at(made.q_z, t, b), at(made.q_w, t, b)
+            p_z, p_w = model.prior_z(here.c[0]), model.prior_w(here.h[0])
+            total += (
+                0.5 * 0.7 * made.reads[t, b] * kl(q_z, of(p_z)).sum() + 0.5 * 0.3 * kl(q_w, of(p_w)).sum()
+            )  # half warm
+            if classes > 1:
+                total -= 0.5 * 0.3 * (q_z.entropy().sum() + q_w.entropy().sum())
             if t < 5 and not data.first[t + 1, b]:
                 p_m = model.prior_m(torch.cat([*here[:4], one_hot(data.actions[t + 1, b])[None]], -1))[0, 0]
                 total += 0.3 * kl(bernoulli(logits=made.q_m[t, b]), bernoulli(logits=p_m)) * 18 / 15  # a mean of 5 × 3
@@ -238,7 +273,7 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path):
     assert_same_states(small_run, tmp_path / "run")
 
 
-@pytest.mark.parametrize("flags", [["--fixed-interval", 4], ["--no-w-reset", "--no-narrow-w", "--decoder-sees-h"]])
+@pytest.mark.parametrize("flags", [["--fixed-interval", 4], ["--w-reset", "--no-decoder-sees-h"], ["--classes", 1]])
 def test_other_models_run(tmp_path, flags):
     run(*SMALL, *flags, "--stop-at", 1000, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
     assert json.loads((tmp_path / "run" / "result.json").read_text())["updates"] == 25

@@ -119,7 +119,7 @@ def corridor_starts() -> CorridorState:
 
 
 def make_learner(**changes) -> method.Learner:
-    args = make_args(deter_z=2, stoch_z=1, **changes)
+    args = make_args(deter_z=2, stoch_z=1, classes=1, **changes)
     torch.manual_seed(0)
     return method.Learner(args, Corridor(), CPU)
 
