@@ -25,6 +25,14 @@ AGENTS = {  # name of the runs -> title, script, colour
     "hwm_fixed": ("HWM Dreamer, fixed interval", "hwm_dreamer", "tab:olive"),
     "hrl_fixed": ("HWM HRL Dreamer, fixed interval", "hwm_hrl_dreamer", "tab:pink"),
 }
+CAUSES = {  # the baseline, and what it does without one of the things that it needs
+    "dreamer": AGENTS["dreamer"],
+    "dreamer_sharp": ("codes may get sharp (--entropy-scale 0)", "dreamer_v2", "tab:red"),
+    "dreamer_slow": ("the model's rate is 1e-3", "dreamer_v2", "tab:orange"),
+    "dreamer_early": ("50,000 steps of random play at first", "dreamer_v2", "tab:brown"),
+    "dreamer_uniform": ("chunks from anywhere (--rewarded-share 0)", "dreamer_v2", "tab:gray"),
+    "dreamer_eps": ("Adam's ε is 1e-5", "dreamer_v2", "black"),
+}
 WINDOW = 200  # episodes
 BINS = 200  # points of a curve
 LEVELS = (0.5, 0.85)  # learning, solved
@@ -73,7 +81,7 @@ def read_run(folder: Path) -> dict:
 def read_runs(folder: Path) -> list[dict]:
     """All runs of known agents that have updates. Raises SystemExit where their sizes or tasks differ."""
     paths = sorted(path.parent for path in folder.glob("*/updates.csv") if path.stat().st_size)
-    runs = [read_run(path) for path in paths if re.sub(r"_seed\d+$", "", path.name) in AGENTS]
+    runs = [read_run(path) for path in paths if re.sub(r"_seed\d+$", "", path.name) in AGENTS | CAUSES]
     kinds = {(run["row"]["size"], run["row"]["env_id"]) for run in runs}
     if len(kinds) != 1:
         raise SystemExit(f"error: --runs {folder}: " + ("holds runs of several kinds" if kinds else "holds no run"))
@@ -89,13 +97,13 @@ def interval(values: list[float], digits: int) -> str:
     return f"{mean:,.{digits}f} ± {half:,.{digits}f}"
 
 
-def table(rows: list[dict]) -> list[str]:
+def table(rows: list[dict], agents: dict = AGENTS) -> list[str]:
     """One line for each agent; where not every seed has come to a return, how many have."""
     lines = [
         "| agent | seeds | steps to 0.5 | steps to 0.85 | last 200 episodes | greedy | dreamed less real return | minutes |"
     ]
     lines.append("|" + "---|" * 8)
-    for agent, (title, _, _) in AGENTS.items():
+    for agent, (title, _, _) in agents.items():
         group = [row for row in rows if row["agent"] == agent]
         if not group:
             continue
@@ -115,25 +123,25 @@ def table(rows: list[dict]) -> list[str]:
     return lines
 
 
-def figure_3_5(runs: list[dict]) -> Figure:
+def curves_figure(runs: list[dict], agents: dict, title: str) -> Figure:
     """Fig. 3.5: the mean over seeds of the moving means, and their range, up to where the shortest run has come."""
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     groups = defaultdict(list)
     for run in runs:
         groups[run["row"]["agent"]].append(run)
-    for agent, (title, _, colour) in AGENTS.items():
+    for agent, (name, _, colour) in agents.items():
         group = groups[agent]
         if not group:
             continue
         at = np.linspace(0, min(run["steps"][-1] for run in group), BINS + 1)[1:]
         curves = np.array([np.interp(at, run["steps"], run["means"]) for run in group])
-        axes.plot(at, curves.mean(0), color=colour, label=f"{title}, {len(group)} seed{'s' * (len(group) > 1)}")
+        axes.plot(at, curves.mean(0), color=colour, label=f"{name}, {len(group)} seed{'s' * (len(group) > 1)}")
         axes.fill_between(at, curves.min(0), curves.max(0), color=colour, alpha=0.15, linewidth=0)
     for level in LEVELS:
         axes.axhline(level, color="black", linestyle=":", linewidth=0.8)
     row = runs[0]["row"]
-    axes.set_title(f"Fig. 3.5: {row['env_id']}, size {row['size']}; mean of {WINDOW} episodes, range over seeds")
+    axes.set_title(f"{title}: {row['env_id']}, size {row['size']}; mean of {WINDOW} episodes, range over seeds")
     axes.set(xlabel="environment steps", ylabel="episodic return", ylim=(0, 1))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.spines[["top", "right"]].set_visible(False)
@@ -142,19 +150,22 @@ def figure_3_5(runs: list[dict]) -> Figure:
 
 
 def write_report(runs: list[dict], out: Path) -> None:
-    """Write the figure, the table and the rows of the runs."""
+    """Write the figures, the tables and the rows of the runs."""
     out.mkdir(parents=True, exist_ok=True)
     rows = [run["row"] for run in runs]
     write_csv(out / "runs.csv", rows)
-    scripts = {(AGENTS[row["agent"]][1], row["script_sha256"]) for row in rows if row["script_sha256"]}
+    scripts = {((AGENTS | CAUSES)[row["agent"]][1], row["script_sha256"]) for row in rows if row["script_sha256"]}
     made_at = ", ".join(f"{name}.py at {commit_of(name, digest)}" for name, digest in sorted(scripts))
     text = [
         f"`benchmark/fourrooms.sh`, {made_at or 'runs that go on'}; this report at {commit()}. One thread each.",
         "",
     ]
     text += table(rows)
+    curves_figure(runs, AGENTS, "Fig. 3.5").savefig(out / "fig_3_5.png", dpi=110)
+    if any(row["agent"] not in AGENTS for row in rows):
+        text += ["", "## What the baseline needs", "", *table(rows, CAUSES)]
+        curves_figure(runs, CAUSES, "What the baseline needs").savefig(out / "causes.png", dpi=110)
     (out / "table.md").write_text("\n".join(text) + "\n")
-    figure_3_5(runs).savefig(out / "fig_3_5.png", dpi=110)
     print("\n".join(text))
 
 

@@ -631,7 +631,12 @@ def test_the_dream_starts_from_what_was_seen(small_run, tmp_path):
 # The report
 def test_steps_to_a_return_and_curves(tmp_path):
     """Runs whose moving mean is known: the step of the 200th episode in a row with as much."""
-    for name, jump in (("dreamer_seed1", 300), ("dreamer_seed2", 500), ("hwm_seed1", 10_000)):
+    for name, jump in (
+        ("dreamer_seed1", 300),
+        ("dreamer_seed2", 500),
+        ("hwm_seed1", 10_000),
+        ("dreamer_slow_seed1", 10_000),
+    ):
         folder = tmp_path / "runs" / name
         folder.mkdir(parents=True)
         about = {"seed": int(name[-1]), "size": "xs", "env_id": "FourRooms11-v0"}
@@ -650,7 +655,10 @@ def test_steps_to_a_return_and_curves(tmp_path):
     )
     assert "| 0.300 ± 0.000 |" in lines[2]
     dreamer_report.write_report(runs, tmp_path / "out")
-    assert (tmp_path / "out" / "fig_3_5.png").read_bytes()[1:4] == b"PNG"
+    for name in ("fig_3_5.png", "causes.png"):
+        assert (tmp_path / "out" / name).read_bytes()[1:4] == b"PNG"
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert text.count("| Dreamer | 2 |") == 2 and text.count("the model's rate is 1e-3 | 1 | not reached") == 1
 
 
 def test_moving_mean():
