@@ -4,12 +4,12 @@
 #   benchmark/fourrooms.sh
 #   STEPS=300000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 300,000 steps
 #   AGENTS="dreamer_sharp dreamer_slow dreamer_early dreamer_uniform dreamer_eps" SEEDS="1 2" benchmark/fourrooms.sh
-#   SIZE=thesis PREFILL=50000 FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh
+#   SIZE=thesis FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4} AGENTS=${AGENTS:-dreamer hwm hrl hwm_fixed hrl_fixed} SIZE=${SIZE:-xs} ENV_ID=${ENV_ID:-FourRooms11-v0}
 WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/dreamer_$SIZE} FLAGS=${FLAGS---bf16}
-PREFILL=${PREFILL:-200000} INTERVAL=${INTERVAL:-8}
+INTERVAL=${INTERVAL:-8}
 script() {  # AGENT: its file and its own flags
   case $1 in
     dreamer) echo dreamer_v2.py ;;
@@ -31,7 +31,7 @@ for seed in $SEEDS; do
   for agent in $AGENTS; do
     read -r file own <<<"$(script "$agent")"
     echo cleanrl_thesis/$file --env-id "$ENV_ID" --size "$SIZE" --seed "$seed" ${STEPS:+--stop-at "$STEPS"} \
-      --run-dir "$RUNS/${agent}_seed$seed" $([[ $own == *--prefill* ]] || echo --prefill "$PREFILL") $own $FLAGS
+      --run-dir "$RUNS/${agent}_seed$seed" $own $FLAGS
   done
 done | xargs -P "$WORKERS" -L 1 sh -c '"$0" "$@" --resume' "$PYTHON"
 "$PYTHON" benchmark/dreamer_report.py --runs "$RUNS"
