@@ -49,7 +49,7 @@ def run(
     else:
         cli, out, err = importlib.import_module(f"cleanrl_thesis.{script.stem}").cli, io.StringIO(), io.StringIO()
         streams = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
-        with contextlib.chdir(cwd), streams[0], streams[1], unlocked_at_the_end():
+        with contextlib.chdir(cwd), streams[0], streams[1], as_a_process_of_its_own():
             returned = cli([str(flag) for flag in flags])
         done = subprocess.CompletedProcess(flags, returned, out.getvalue(), err.getvalue())
     assert done.returncode == code, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
@@ -57,12 +57,13 @@ def run(
 
 
 @contextlib.contextmanager
-def unlocked_at_the_end():
-    """Let go of the run folders that are locked in here; a script leaves that to the end of its process."""
+def as_a_process_of_its_own():
+    """Take back what a script leaves to the end of its process: run folders that are locked, denormals that are flushed."""
     with unittest.mock.patch.object(fcntl, "flock", side_effect=fcntl.flock) as flock:
         yield
     for call in flock.call_args_list:
         os.close(call.args[0])
+    torch.set_flush_denormal(False)
 
 
 def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:
