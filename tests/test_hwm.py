@@ -1,5 +1,6 @@
 """The hierarchical world model: its distributions, COPY and UPDATE, boundaries and measures, against independent sources."""
 
+import csv
 import itertools
 import json
 import math
@@ -18,6 +19,7 @@ from cleanrl_thesis import hwm_segment as method
 from cleanrl_thesis import ppo_fourrooms as rooms
 
 sys.path.append(str(ROOT / "benchmark"))
+import hwm_agreement  # noqa: E402
 import hwm_report  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "hwm_segment.py"
@@ -574,3 +576,47 @@ def test_report_of_part_of_the_runs(small_run, tmp_path):
 def test_interval_of_two_seeds():
     assert hwm_report.interval([1.0, 2.0]) == "1.50 ± 6.35"  # 12.706 · 0.7071 / √2
     assert hwm_report.interval([1.0]) == "1.00"
+
+
+@pytest.mark.parametrize(
+    ("reads", "agreed"),
+    [
+        ([[4], [5], [5], [], []], [5]),  # 2 + 2/3 of five
+        ([[4], [5], [6], [], []], []),  # 1 + 2 · 2/3 of five
+        ([[2], [2], [2], [7], [7], [7]], [2, 7]),
+        ([[0, 9], [0, 9], [0, 9]], [0, 9]),  # at the ends of the episode
+        ([[3, 4, 5], [3, 4, 5], [3, 4, 5]], [4]),  # one event, not three
+    ],
+)
+def test_where_models_agree(reads, agreed):
+    votes = np.stack([np.isin(np.arange(10), each) for each in reads])
+    assert np.flatnonzero(hwm_agreement.agree(votes)).tolist() == agreed
+
+
+def test_models_of_an_episode_of_one_step_agree():
+    assert hwm_agreement.agree(np.zeros((3, 0), bool)).shape == (0,)
+
+
+def test_where_boundaries_are_beside_the_border_of_a_room():
+    rooms_, found = np.array([0, 0, 4, 1, 1, 1]), np.array([False, True, False, False, True])
+    counts = hwm_agreement.offsets([found], [rooms_])  # the room is left with step 2, boundaries are at 1 and 4
+    assert counts.tolist() == [0, 0, 0, 1, 0, 0, 1, 0, 0]
+
+
+def test_report_of_agreement(small_run, tmp_path):
+    """Its models are those that the runs measured; runs of other rungs and earlier seeds stay out."""
+    for name in ("narrow_seed1", "narrow_seed2", "narrow_seed3", "faithful_seed4"):
+        folder = shutil.copytree(small_run, tmp_path / "runs" / name)
+        result = json.loads((folder / "result.json").read_text())
+        (folder / "result.json").write_text(json.dumps({**result, "seed": int(name[-1])}))
+    args = hwm_agreement.Args(runs=tmp_path / "runs", size=2, first_seed=2, out=tmp_path / "out")
+    hwm_agreement.main(args)
+    assert sorted(path.name for path in args.out.iterdir()) == ["agreement.csv", "agreement.md", "agreement.png"]
+    rows = list(csv.DictReader((args.out / "agreement.csv").open()))
+    assert [(row["boundaries"], row["seeds"]) for row in rows] == [
+        *(("one model", "2"), ("one model", "3"), ("2 models agree", "2 3"))
+    ]
+    measured = json.loads((small_run / "segmentation.json").read_text())["prior"]
+    assert all(float(rows[0][key]) == measured[key] for key in hwm_agreement.MEASURES)
+    with pytest.raises(SystemExit, match=r"--runs .* has 1 finished runs narrow_seedN"):
+        hwm_agreement.main(hwm_agreement.Args(runs=tmp_path / "runs", size=2, first_seed=3, out=tmp_path / "out"))

@@ -1,0 +1,183 @@
+"""Where several world models agree that a segment ends: boundaries by the votes of runs that differ in the seed alone.
+
+    RUNGS=narrow SEEDS="$(seq -s ' ' 1 33)" benchmark/hwm_segment.sh
+    python benchmark/hwm_agreement.py     # runs/hwm_segment -> benchmark/results/hwm_segment/agreement.md and a figure
+
+One model reads once on its way into another room, but at which step around the door differs from seed to seed, for the bound
+(Eq. 3.3.5) hardly tells these steps apart. Boundaries that people see in a film are settled in the same way: by the steps at
+which many of them press the button. Here a model votes for the steps at which p(m) reads, each vote counts for the steps
+beside it too, but less, and a boundary is where the sum is greatest, if it is at least half of the number of models.
+
+`KERNEL` and `SHARE` were chosen on seeds 1 to 8; the committees of the table are of other seeds, and have none in common.
+"""
+
+import json
+import re
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+import tyro
+from common import ROOT, commit, commit_of, finished_runs, write_csv
+from hwm_report import IGNORANT, interval
+from matplotlib.figure import Figure
+
+sys.path.insert(0, str(ROOT))
+from cleanrl_thesis import hwm_segment as hwm  # noqa: E402
+
+KERNEL = np.array([1, 2, 3, 2, 1]) / 3  # what a vote counts for the steps around it
+SHARE = 0.5  # of the models that a boundary needs
+MEASURES = {
+    "f1_4_rooms_0": "F1, 4 rooms, exact",
+    "f1_4_rooms_1": "± 1 step",
+    "f1_8_labels_0": "F1, 8 labels, exact",
+    "f1_8_labels_1": "± 1 step",
+    "read_rate": "reads",
+    "door_entry_recall": "doors found",
+    "read_rate_inside_rooms": "reads inside rooms",
+}
+FARTHEST = 4  # steps from a room's border that the figure shows
+
+
+@dataclass
+class Args:
+    runs: Path = Path("runs/hwm_segment")
+    """folder of the runs' folders, each with its model (`--save-model`)"""
+    rung: str = "narrow"
+    """runs RUNG_seedN are taken"""
+    size: int = 5
+    """models of a committee"""
+    first_seed: int = 9
+    """the first committee begins with this seed"""
+    out: Path = ROOT / "benchmark" / "results" / "hwm_segment"
+    """folder for the table, the committees and the figure"""
+
+
+def agree(votes: np.ndarray) -> np.ndarray:
+    """Boundaries (T,) bool of the models' (N, T): the greatest sums of votes first, no two within the kernel's reach."""
+    reach, steps = len(KERNEL) // 2, votes.shape[1]
+    agreed = np.zeros(steps, bool)
+    if steps == 0:
+        return agreed
+    sums = np.convolve(votes.sum(0), KERNEL)[reach : reach + steps]
+    while sums.max() > SHARE * len(votes) - 1e-9:
+        t = int(sums.argmax())
+        agreed[t] = True
+        sums[max(0, t - reach) : t + reach + 1] = -1
+    return agreed
+
+
+def read_args(run: Path) -> hwm.Args:
+    """The arguments of a run."""
+    args = hwm.Args(**json.loads((run / "args.json").read_text()))
+    args.max_grad_norm = float(args.max_grad_norm)  # JSON has no infinity
+    args.demos, args.heldout_demos = Path(args.demos), args.heldout_demos and Path(args.heldout_demos)
+    return args
+
+
+def segment(run: Path) -> tuple[list[np.ndarray], list[hwm.Episode]]:
+    """What the model of a run finds in the held-out episodes, m from p (section 3.5.1), and these."""
+    args = read_args(run)
+    episodes, _ = hwm.read_split(args)
+    mean = np.concatenate([episode.frames for episode in episodes.training]).mean(0) / 255
+    normalizer = hwm.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32))
+    model = hwm.HWM(args, mean.size, max(int(episode.actions.max()) for episode in episodes.training) + 1)
+    model.load_state_dict(safetensors.torch.load_file(run / "model.safetensors"))
+    return hwm.segment(model, episodes.heldout, normalizer, "prior", torch.device("cpu")).found, episodes.heldout
+
+
+def offsets(found: list[np.ndarray], rooms: list[np.ndarray]) -> np.ndarray:
+    """Boundaries at each of -FARTHEST to FARTHEST steps from the step with which a room is left, per crossing."""
+    counts, crossings = np.zeros(2 * FARTHEST + 1), 0
+    for made, each in zip(found, rooms):
+        merged = hwm.merge_doors(each)
+        for t in np.flatnonzero(merged[1:] != merged[:-1]):
+            near = np.flatnonzero(made) - t
+            counts += np.bincount(near[abs(near) <= FARTHEST] + FARTHEST, minlength=len(counts))
+            crossings += 1
+    return counts / crossings
+
+
+def score(name: str, seeds: list[int], found: list[np.ndarray], episodes: list[hwm.Episode]) -> dict:
+    """A row of the table: the measures, and whether both of 4 rooms are above all segmentations that know nothing."""
+    rooms, states = [each.rooms for each in episodes], [each.states for each in episodes]
+    made = hwm.boundary_scores(found, rooms)
+    floors = hwm.floors(rooms, states, made["read_rate"], np.random.default_rng(0))
+    best = {
+        key: max(floor[key] for title, floor in floors.items() if re.fullmatch(IGNORANT, title))
+        for key in MEASURES
+        if key.startswith("f1")
+    }
+    row = {"boundaries": name, "seeds": " ".join(map(str, seeds)), **{key: made[key] for key in MEASURES}}
+    row["above_floors_of_4_rooms"] = all(made[key] > best[key] for key in ("f1_4_rooms_0", "f1_4_rooms_1"))
+    row |= {f"best_floor_{key}": value for key, value in best.items()}
+    return row | {f"at_{i - FARTHEST:+d}": value for i, value in enumerate(offsets(found, rooms))}
+
+
+def table(rows: list[dict]) -> list[str]:
+    """Models and committees, means with 95% t-intervals, and the best floor."""
+    lines = [f"| boundaries | of | {' | '.join(MEASURES.values())} | above floors of 4 rooms |"]
+    lines.append("|" + "---|" * (len(MEASURES) + 3))
+    for name in dict.fromkeys(row["boundaries"] for row in rows):
+        group = [row for row in rows if row["boundaries"] == name]
+        cells = [interval([row[key] for row in group]) for key in MEASURES]
+        above = sum(row["above_floors_of_4_rooms"] for row in group)
+        lines.append(f"| {name} | {len(group)} | {' | '.join(cells)} | {above} of {len(group)} |")
+    best = [f"{np.mean([row[f'best_floor_{key}'] for row in rows]):.2f}" if key[:2] == "f1" else "" for key in MEASURES]
+    return [*lines, f"| best of those that know nothing | | {' | '.join(best)} | |"]
+
+
+def draw(rows: list[dict], path: Path) -> None:
+    """Where boundaries are, by steps from the step with which a room is left: one line for each model and committee."""
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    names = list(dict.fromkeys(row["boundaries"] for row in rows))
+    for name, axis in zip(names, figure.subplots(1, len(names), sharey=True)):
+        for row in rows:
+            if row["boundaries"] == name:
+                x = range(-FARTHEST, FARTHEST + 1)
+                axis.plot(x, [row[f"at_{i:+d}"] for i in x], marker="o", markersize=3, alpha=0.6)
+        axis.axvspan(-1, 1, color="0.9", zorder=0)
+        axis.set(title=name, xlabel="steps after the room is left", xticks=range(-FARTHEST, FARTHEST + 1))
+    figure.axes[0].set_ylabel("boundaries per crossing")
+    figure.savefig(path, dpi=120)
+
+
+def main(args: Args) -> None:
+    """Measure each model and each committee, and write table, rows and figure."""
+    runs = {
+        result["seed"]: run
+        for run, result in finished_runs(args.runs)
+        if run.name == f"{args.rung}_seed{result['seed']}"
+    }
+    seeds = sorted(seed for seed in runs if seed >= args.first_seed)
+    groups = [seeds[i : i + args.size] for i in range(0, len(seeds) - args.size + 1, args.size)]
+    if not groups:
+        found = f"has {len(seeds)} finished runs {args.rung}_seedN from --first-seed {args.first_seed} on"
+        raise SystemExit(f"error: --runs {args.runs}: {found}, --size {args.size} are needed")
+    rows, committees = [], []
+    for group in groups:
+        parts = [segment(runs[seed]) for seed in group]
+        episodes = parts[0][1]
+        rows += [score("one model", [seed], found, episodes) for seed, (found, _) in zip(group, parts)]
+        agreed = [agree(np.stack(votes)) for votes in zip(*(found for found, _ in parts))]
+        committees.append(score(f"{args.size} models agree", group, agreed, episodes))
+    rows += committees
+    results = [json.loads((runs[seed] / "result.json").read_text()) for group in groups for seed in group]
+    scripts = sorted({commit_of("hwm_segment", result["script_sha256"]) for result in results})
+    hours = sum(result["training_seconds"] for result in results) / 3600
+    text = [f"`benchmark/hwm_agreement.py` at {commit()}, runs of hwm_segment.py at {', '.join(scripts)}: ", ""]
+    text[0] += f"{len(results)} runs {args.rung}, {hours:.1f} core-hours, one thread each."
+    text += table(rows)
+    args.out.mkdir(parents=True, exist_ok=True)
+    (args.out / "agreement.md").write_text("\n".join(text) + "\n")
+    write_csv(args.out / "agreement.csv", rows)
+    draw(rows, args.out / "agreement.png")
+    print("\n".join(text))
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
