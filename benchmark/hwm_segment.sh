@@ -9,7 +9,7 @@ SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/pytho
 RUNGS=${RUNGS:-narrow faithful reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
 mkdir -p "$RUNS"
 record() {  # DEMOS flags...: episodes of the player stopped at 1,100,000 steps, unless they are there
-  [ -e "$PLAYER/$1/manifest.json" ] || "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --compile --save-model \
+  [ -e "$PLAYER/$1/manifest.json" ] || "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-model \
     --run-dir "$PLAYER" --resume "${@:2}" >&2
 }
 record demos --save-demos 2300

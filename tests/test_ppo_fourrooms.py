@@ -205,6 +205,26 @@ def test_compiled_and_plain_agree(tmp_path):
     assert torch.allclose(results[0][1], results[1][1], atol=1e-4)
 
 
+def test_bfloat16_and_float32_agree():
+    """The same minibatch, the same parameters: policy and values, and the direction of the gradient."""
+    rng, results = np.random.default_rng(0), []
+    frames = torch.from_numpy(rng.integers(0, 256, (32, 22, 22, 3), np.uint8))
+    numbers = torch.from_numpy(rng.normal(size=(3, 32)).astype(np.float32))
+    batch = method.Batch(frames, torch.from_numpy(rng.integers(0, 3, 32)), -numbers[0].abs(), *numbers[1:])
+    for bf16 in (False, True):
+        torch.manual_seed(0)
+        agent = method.Agent(22, 3, 8, 32, bf16)
+        made = agent(frames)
+        assert all(part.dtype == torch.float32 for part in made)
+        method.ppo_loss(*made, batch, 0.2, 0.01, 0.5)[0].backward()
+        gradient = torch.cat([parameter.grad.flatten() for parameter in agent.parameters()])
+        results.append((*(part.detach() for part in made), gradient))
+    single, half = results
+    assert not torch.equal(single[2], half[2])
+    assert torch.allclose(single[0], half[0], atol=2e-3) and torch.allclose(single[1], half[1], rtol=0.02, atol=0.02)
+    assert torch.cosine_similarity(single[2], half[2], 0) > 0.995
+
+
 def test_a_folder_of_another_run_is_refused(small_run, tmp_path):
     words = ["--seed 2 (was 1)", "must be as in"]
     done = run(*SMALL, "--run-dir", small_run, "--resume", "--seed", 2, cwd=tmp_path, code=2, script=SCRIPT)
