@@ -1,8 +1,10 @@
 """PPO in FourRooms: runs -> one table of their returns beside the shortest ways from the same starts.
 
 for seed in 1 2 3; do
-  python cleanrl_thesis/ppo_fourrooms.py --seed $seed --save-model --run-dir runs/fourrooms/11_seed$seed
+  python cleanrl_thesis/ppo_fourrooms.py --bf16 --seed $seed --save-model --run-dir runs/fourrooms/11_seed$seed --resume
 done
+python cleanrl_thesis/ppo_fourrooms.py --env-id FourRooms19-v0 --bf16 --total-timesteps 12000000 --save-model \\
+  --run-dir runs/fourrooms/19_seed1 --resume
 python benchmark/fourrooms_players.py        # runs/fourrooms -> benchmark/results/fourrooms
 """
 

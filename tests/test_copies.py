@@ -33,6 +33,7 @@ HWM_AGENTS = {
     "HWM": "filters and dreams, by the actions before the frames; heads for reward and discount; categorical v and y",
     "Inference": "v and y may be categorical",
     "mlp": "ELU, torch's own initialisation",
+    "Posterior": "cannot tell the ends of a chunk, which are shorter than those of the world model alone",
     "schedule": "of updates that go on as long as the agent plays",
 }
 DIFFERS: dict[tuple[str, str], str] = {

@@ -163,6 +163,15 @@ def test_nothing_leaks_over_the_border_of_an_episode():
         assert torch.equal(before[3:], after[3:])
 
 
+def test_boundaries_see_no_ends_of_chunks():
+    """In frames that stand still every step looks the same, where an episode or the chunk begins or ends too."""
+    model, data = make_model(), make_data([[1, 0, 0, 1, 0, 0]])
+    embed = torch.ones(6, 1, model.embed.out_features)
+    logits = model.posterior_m(embed, data.first)
+    assert torch.allclose(logits, logits[:1].expand_as(logits))
+    assert model.posterior_m(embed + torch.randn_like(embed), data.first).std() > 0
+
+
 @pytest.mark.parametrize("classes", [1, 4])
 def test_loss_is_the_sum_of_its_terms(classes):
     """Eq. 3.3.5 and J_R by torch.distributions; m_t pairs with the action that followed step t."""
@@ -197,7 +206,7 @@ def test_loss_is_the_sum_of_its_terms(classes):
                 0.5 * 0.7 * made.reads[t, b] * kl(q_z, of(p_z)).sum() + 0.5 * 0.3 * kl(q_w, of(p_w)).sum()
             )  # half warm
             if classes > 1:
-                total -= 0.5 * 0.3 * (q_z.entropy().sum() + q_w.entropy().sum())
+                total -= 0.5 * 0.3 * (made.reads[t, b] * q_z.entropy().sum() + q_w.entropy().sum())
             if t < 5 and not data.first[t + 1, b]:
                 p_m = model.prior_m(torch.cat([*here[:4], one_hot(data.actions[t + 1, b])[None]], -1))[0, 0]
                 total += 0.3 * kl(bernoulli(logits=made.q_m[t, b]), bernoulli(logits=p_m)) * 18 / 15  # a mean of 5 × 3
@@ -206,22 +215,27 @@ def test_loss_is_the_sum_of_its_terms(classes):
             total -= 5 * torch.log(1 - goes_on if data.terminals[t, b] else goes_on)
     assert loss.item() == pytest.approx(total.item() / 18, rel=1e-4)
     assert all(torch.equal(a, b) for a, b in zip(belief, made.belief))
-    decides = 1 - data.first[1:]
+    settled = (1 - data.first[1:]) * (1 - data.first[:-1])  # steps that neither begin an episode nor come next
     assert parts["losses/read_rate"].item() == pytest.approx(
-        (made.reads[1:] * decides).sum().item() / decides.sum().item()
+        (made.reads[1:] * settled).sum().item() / settled.sum().item()
     )
 
 
 def test_reads_beyond_the_budget_cost_their_price():
-    data = make_data([[1, 0, 0, 0, 0, 0]])
-    losses = []
+    """The expected ones, by q(m), of the steps after the second; the gradient reaches q(m)."""
+    data, losses, slopes = make_data([[1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0]]), [], []
     for price in (0.0, 10.0):
         torch.manual_seed(5)
-        loss, _, parts = method.world_model_loss(make_model(budget_price=price, budget=0.1), data, 10**6)
+        model = make_model(budget_price=price, budget=0.1)
+        loss, _, _ = method.world_model_loss(model, data, 10**6)
+        loss.backward()
         losses.append(loss.item())
-    torch.manual_seed(5)
-    rate = parts["losses/read_rate"].item()
+        slopes.append(model.posterior_m.logit.bias.grad.item())
+    embed = model.embedding(model.normalize(data.frames.flatten(0, 1))).unflatten(0, data.first.shape)
+    q_m = torch.sigmoid(model.posterior_m(embed, data.first))
+    rate = torch.cat([q_m[1:5, 0], q_m[1:2, 1], q_m[4:5, 1]]).mean().item()
     assert rate > 0.1 and losses[1] - losses[0] == pytest.approx(10 * (rate - 0.1), rel=1e-3)
+    assert slopes[1] > slopes[0]
 
 
 def test_budget_and_temperature_come_down():
@@ -242,7 +256,8 @@ def test_a_fixed_interval_reads_every_k_steps_from_an_episodes_first():
     assert ages == [1, 2, 0, 1, 2, 0, 1]
     loss, _, parts = method.world_model_loss(model, data, 0)
     assert torch.isfinite(loss) and parts["losses/kl_m"] == 0
-    assert parts["losses/read_rate"].item() == pytest.approx(2 / 9)  # of the steps that begin no episode
+    assert parts["losses/read_rate"].item() == pytest.approx(2 / 6)  # of the steps that neither begin nor come next
+    assert parts["losses/segment_length"].item() == pytest.approx(6 / 2)
 
 
 # Runs
