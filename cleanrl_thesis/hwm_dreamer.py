@@ -13,8 +13,8 @@ only where a segment begins, w_t with each step. Actor and critic see both, and 
 | Eq. 3.3.11 | adds J_HWM, a bound to maximise, to losses to minimise | −J_HWM + J_R + J_AC |
 | Eq. 3.3.9 | − log π · V − η H | the λ-return less the slow critic in the place of V |
 | end of an episode | not in the model | a discount head, as in the baseline |
-| v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all; normal ones (`--classes 1`) foretold the agent's moves worse in every run tried |
-| boundaries | Eq. 3.3.1 to 3.3.7 | a budget of reads and a q(m) that starts with many; without them nothing is read after the first frame |
+| v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all (`--classes 1`: normal) |
+| boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; whether segments last is not measured yet |
 | the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.7); no read or copy is forced within an episode |
 | faithful model | | `--classes 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0 --kl-m-scale 1` |
 | acting | not said | m from p(m), z from q where it is read, w from q |
@@ -1278,6 +1278,7 @@ class Learner:
         self.optimizers = {name: self.make_optimizer(name) for name in self.modules}
 
     def make_optimizer(self, name: str) -> torch.optim.AdamW:
+        """Adam with decoupled weight decay for one of the modules, at the rate of its kind."""
         args = self.args
         rates = {
             "model": args.model_learning_rate,
@@ -1484,6 +1485,7 @@ class Collector:
         }
 
     def load_state_dict(self, state: dict) -> None:
+        """Go on from what `state_dict` returned, and from the rows of the replay buffer's file."""
         games = self.envs.games
         for name, tensor in state["games"].items():
             array = getattr(games, name)

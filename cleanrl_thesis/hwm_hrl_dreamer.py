@@ -1366,6 +1366,7 @@ class Learner:
         self.optimizers = {name: self.make_optimizer(name) for name in self.modules}
 
     def make_optimizer(self, name: str) -> torch.optim.AdamW:
+        """Adam with decoupled weight decay for one of the modules, at the rate of its kind."""
         args = self.args
         rates = {
             "model": args.model_learning_rate,
@@ -1578,6 +1579,7 @@ class Collector:
         }
 
     def load_state_dict(self, state: dict) -> None:
+        """Go on from what `state_dict` returned, and from the rows of the replay buffer's file."""
         games = self.envs.games
         for name, tensor in state["games"].items():
             array = getattr(games, name)

@@ -86,7 +86,7 @@ class Args:
     num_threads: int = 1
     """threads of torch; one lets a sweep fill the machine with runs"""
     compile: bool = False
-    """compile the loss and its gradient (needs a C++ compiler); for a GPU: on the CPUs measured it is slower than without"""
+    """compile the loss and its gradient (needs a C++ compiler; compiling takes seconds, once); slower than without on the CPU that it was tried on"""
     bf16: bool = False
     """convolutions and the hidden layer in bfloat16: faster where the processor has instructions for it"""
     track: bool = False
