@@ -603,20 +603,30 @@ def test_where_boundaries_are_beside_the_border_of_a_room():
     assert counts.tolist() == [0, 0, 0, 1, 0, 0, 1, 0, 0]
 
 
+def halve_kl_m(path) -> None:
+    rows = list(csv.DictReader(path.open()))
+    with open(path, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows({**row, "losses/kl_m": float(row["losses/kl_m"]) / 2} for row in rows)
+
+
 def test_report_of_agreement(small_run, tmp_path):
-    """Its models are those that the runs measured; runs of other rungs and earlier seeds stay out."""
+    """Its models are those that the runs measured, its committee that with the least KL_m; other rungs and seeds stay out."""
     for name in ("narrow_seed1", "narrow_seed2", "narrow_seed3", "faithful_seed4"):
         folder = shutil.copytree(small_run, tmp_path / "runs" / name)
         result = json.loads((folder / "result.json").read_text())
         (folder / "result.json").write_text(json.dumps({**result, "seed": int(name[-1])}))
-    args = hwm_agreement.Args(runs=tmp_path / "runs", size=2, first_seed=2, out=tmp_path / "out")
+    halve_kl_m(tmp_path / "runs" / "narrow_seed3" / "updates.csv")
+    args = hwm_agreement.Args(runs=tmp_path / "runs", size=1, trained=2, first_seed=2, out=tmp_path / "out")
     hwm_agreement.main(args)
     assert sorted(path.name for path in args.out.iterdir()) == ["agreement.csv", "agreement.md", "agreement.png"]
     rows = list(csv.DictReader((args.out / "agreement.csv").open()))
     assert [(row["boundaries"], row["seeds"]) for row in rows] == [
-        *(("one model", "2"), ("one model", "3"), ("2 models agree", "2 3"))
+        *(("one model", "2"), ("one model", "3"), ("1 of 2 models agree", "3"))
     ]
+    assert float(rows[0]["kl_m"]) == 2 * float(rows[1]["kl_m"]) == 2 * float(rows[2]["kl_m"]) > 0
     measured = json.loads((small_run / "segmentation.json").read_text())["prior"]
     assert all(float(rows[0][key]) == measured[key] for key in hwm_agreement.MEASURES)
     with pytest.raises(SystemExit, match=r"--runs .* has 1 finished runs narrow_seedN"):
-        hwm_agreement.main(hwm_agreement.Args(runs=tmp_path / "runs", size=2, first_seed=3, out=tmp_path / "out"))
+        hwm_agreement.main(hwm_agreement.Args(runs=tmp_path / "runs", trained=2, first_seed=3, out=tmp_path / "out"))
