@@ -3,12 +3,13 @@
     python benchmark/speed.py ppo                                  # about 15 minutes; needs the group `bench`
     python benchmark/speed.py ppo --update-epochs 10 --rounds 1    # a first look
     python benchmark/speed.py apple                                # the game alone, and DQN on it; about 3 minutes
+    python benchmark/speed.py gopher                               # DQN on Gopher's pixels; about 8 minutes
     python benchmark/speed.py torcs                                # the simulator alone, and DDPG on it; about 12 minutes
     python benchmark/speed.py gail                                 # GAIL beside TRPO without it; about 3 minutes
     python benchmark/speed.py rooms                                # FourRooms beside MiniGrid; about a minute
     python benchmark/speed.py dreamer                              # a Dreamer's gradient step and its parts; about 8 minutes
 
-Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,torcs,gail,rooms,dreamer}.json` and `.md`: the median of each contender and of its ratios to
+Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,gopher,torcs,gail,rooms,dreamer}.json` and `.md`: the median of each contender and of its ratios to
 the peer, round by round, with their range. The ratios are the result: the machine's own speed drifts.
 """
 
@@ -32,7 +33,7 @@ PEER = "stable-baselines3"
 
 @dataclass
 class Args:
-    what: tyro.conf.Positional[Literal["ppo", "apple", "torcs", "gail", "rooms", "dreamer"]]
+    what: tyro.conf.Positional[Literal["ppo", "apple", "gopher", "torcs", "gail", "rooms", "dreamer"]]
     """what to time"""
     rounds: int = 4
     """how often each contender runs, in turn"""
@@ -96,6 +97,18 @@ def dqn_contenders(work: Work) -> dict:
         PEER: lambda: time_peer("sb3_dqn.py", work.steps),
         "plain": lambda: time_ours("dqn_apple.py", *flags),
         "--compile": lambda: time_ours("dqn_apple.py", *flags, "--compile"),
+    }
+
+
+def gopher_contenders(work: Work) -> dict:
+    """Like for like, which is without double and dueling DQN; and as the README trains the teacher."""
+    flags = ["--total-timesteps", work.steps, "--buffer-size", 20_000, "--learning-starts", 800]
+    simple = [*flags, "--no-double", "--no-dueling"]
+    return {
+        PEER: lambda: time_peer("sb3_dqn_gopher.py", work.steps),
+        "plain": lambda: time_ours("dqn_gopher.py", *simple),
+        "--bf16": lambda: time_ours("dqn_gopher.py", *simple, "--bf16"),
+        "--bf16, double and dueling": lambda: time_ours("dqn_gopher.py", *flags, "--bf16"),
     }
 
 
@@ -208,6 +221,11 @@ def time_apple(args: Args) -> None:
     write_results(args, "apple", "", [measure(work, dqn_contenders(work), args.rounds)], game)
 
 
+def time_gopher(args: Args) -> None:
+    work = Work("ALE/Gopher-v5", None, 32_000)
+    write_results(args, "gopher", "", [measure(work, gopher_contenders(work), args.rounds)])
+
+
 def time_torcs(args: Args) -> None:
     name = "cleanrl_thesis.ddpg_torcs_like:TorcsLike-v0"
     simulator = {"TorcsLike-v0, 1,024 cars side by side": time_environment(name, 1024, 400, args.rounds)}
@@ -288,5 +306,5 @@ if __name__ == "__main__":
         os.environ[name] = "1"  # before numpy is imported
     arguments = tyro.cli(Args)
     times = {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail, "rooms": time_rooms}
-    times |= {"dreamer": time_dreamer}
+    times |= {"dreamer": time_dreamer, "gopher": time_gopher}
     times[arguments.what](arguments)

@@ -10,6 +10,7 @@ METHODS = sorted(
 )
 # (name, file): one line that says why it differs there; files with the same line have to be equal
 PPO, DQN, DISTILL = "ppo_continuous_kle.py", "dqn_apple.py", "distill_hybrid.py"
+GOPHER = "dqn_gopher.py"
 DDPG, GAIL = "ddpg_torcs_like.py", "gail_hybrid.py"
 ROOMS, HWM = "ppo_fourrooms.py", "hwm_segment.py"
 DREAMER, HWM_DREAMER, HRL = "dreamer_v2.py", "hwm_dreamer.py", "hwm_hrl_dreamer.py"
@@ -25,6 +26,19 @@ DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's 
     "make_games": "the driving task with its options",
     "play": "games that are made by the caller, continuous actions",
     "record_video": "continuous actions",
+}
+ATARI = {
+    "FPS": "the console's frames a second",
+    "Learner": "of DQN",
+    "Minibatch": "stacks of frames, one step",
+    "Players": "games of ale-py",
+    "ReplayBuffer": "each frame once",
+    "check_video": "games of ale-py",
+    "make_env": "games of ale-py",
+    "play": "games of ale-py; keeps the emulator's state instead of frames",
+    "record_video": "games of ale-py",
+    "save_demonstrations": "games of ale-py, nearly greedy",
+    "write_demonstrations": "without the frames",
 }
 HWM_AGENTS = {
     "SIZES": "sizes of the HWM",
@@ -49,6 +63,7 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("record_video", DQN): "repeats an action for several frames, and is always greedy",
     ("save_demonstrations", PPO): "plays one environment after the other",
     ("save_demonstrations", DISTILL): "the student's policy, sampled or greedy",
+    **{(name, GOPHER): reason for name, reason in ATARI.items()},
     **{(name, file): reason for name, reason in DRIVING.items() for file in (DDPG, GAIL)},
     ("FlatAdam", DDPG): "actor and critic with a rate each, and their target networks",
     ("Means", DDPG): "metrics of DDPG",

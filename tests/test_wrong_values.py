@@ -6,6 +6,7 @@ from conftest import assert_refused
 from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_apple as dqn
+from cleanrl_thesis import dqn_gopher as gopher
 from cleanrl_thesis import dreamer_v2 as dreamer
 from cleanrl_thesis import gail_hybrid as gail
 from cleanrl_thesis import hwm_dreamer, hwm_hrl_dreamer
@@ -23,6 +24,20 @@ BAD_DQN = [
     (["--n-step", 0], ["--n-step", "0"]),
     (["--learning-rate", "-1"], ["--learning-rate"]),
     (["--no-such-flag"], ["--no-such-flag"]),
+    (["--resume"], ["--resume", "--run-dir"]),
+]
+BAD_GOPHER = [
+    (["--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "ALE/*-v5"]),
+    (["--env-id", "ALE/NoSuchGame-v5"], ["--env-id", "NoSuchGame"]),
+    (["--obs-type", "sound"], ["--obs-type", "sound"]),
+    (["--total-timesteps", 31], ["--total-timesteps", "31", "32 frames"]),
+    (["--buffer-size", 39], ["--buffer-size", "39", "40"]),
+    (["--hidden-size", 33], ["--hidden-size", "33", "even"]),
+    (["--frame-stack", 256], ["--frame-stack", "256", "255"]),
+    (["--noop-max", "-1"], ["--noop-max", "-1"]),
+    (["--eval-epsilon", 2], ["--eval-epsilon", "2.0", "between 0 and 1"]),
+    (["--gamma", "nan"], ["--gamma", "nan"]),
+    (["--train-frequency", 0], ["--train-frequency", "0"]),
     (["--resume"], ["--resume", "--run-dir"]),
 ]
 BAD_DISTILL = [
@@ -123,7 +138,15 @@ BAD_HWM_DREAMER = [
     (["--resume"], ["--resume", "--run-dir"]),
 ]
 BAD_HRL = [*BAD_HWM_DREAMER, (["--num-skills", 1], ["--num-skills", "1", "at least 2"])]
-BAD = {dqn: BAD_DQN, distill: BAD_DISTILL, ddpg: BAD_DDPG, gail: BAD_GAIL, rooms: BAD_ROOMS, hwm: BAD_HWM}
+BAD = {
+    dqn: BAD_DQN,
+    gopher: BAD_GOPHER,
+    distill: BAD_DISTILL,
+    ddpg: BAD_DDPG,
+    gail: BAD_GAIL,
+    rooms: BAD_ROOMS,
+    hwm: BAD_HWM,
+}
 BAD |= {dreamer: BAD_DREAMER, hwm_dreamer: BAD_HWM_DREAMER, hwm_hrl_dreamer: BAD_HRL}
 
 

@@ -1,0 +1,337 @@
+"""dqn_gopher.py: the game beside Gymnasium's wrappers, the replay buffer beside a list, runs through the command line."""
+
+import csv
+import json
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import ale_py
+import gymnasium as gym
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from conftest import ROOT, assert_refused, command, kill_twice, run
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
+
+from cleanrl_thesis import dqn_gopher as dqn
+
+SCRIPT = ROOT / "cleanrl_thesis" / "dqn_gopher.py"
+RAM = ["--obs-type", "ram", "--hidden-size", 32, "--eval-episodes", 2, "--eval-epsilon", 0.5]
+SMALL = [
+    *(*RAM, "--total-timesteps", 20_000, "--num-envs", 4, "--buffer-size", 3_000, "--learning-starts", 4_000),
+    *("--checkpoint-interval", 4_000),
+]
+RECORDS = ("episodes.csv", "updates.csv", "evaluation.json")
+
+
+# The game
+def gymnasiums(env_id: str, obs_type: str) -> gym.Env:
+    gym.register_envs(ale_py)
+    if obs_type == "ram":
+        return FrameStackObservation(gym.make(env_id, obs_type="ram"), 4)
+    return FrameStackObservation(AtariPreprocessing(gym.make(env_id, frameskip=1)), 4)
+
+
+@pytest.mark.parametrize(
+    "env_id, obs_type, frames",
+    [("ALE/Gopher-v5", "pixels", 1_000), ("ALE/Breakout-v5", "pixels", 300), ("ALE/Gopher-v5", "ram", 1_000)],
+)
+def test_frames_are_gymnasiums(env_id, obs_type, frames):
+    """Over episodes with and without seeds, whose actions the emulator repeats by chance."""
+    theirs = gymnasiums(env_id, obs_type)
+    ours = dqn.make_env(env_id, obs_type=obs_type, noop_max=30 if obs_type == "pixels" else 0)
+    rng, seeds = np.random.default_rng(0), iter([5, 6, None, None, None, None])
+    assert ours.observation_space == theirs.observation_space and ours.action_space == theirs.action_space
+    ended = True
+    for _ in range(frames):
+        if ended:
+            seed = next(seeds)
+            (expected, _), (obs, _) = theirs.reset(seed=seed), ours.reset(seed=seed)
+            assert np.array_equal(obs, expected)
+        action = int(rng.integers(ours.action_space.n))
+        expected, obs = theirs.step(action), ours.step(action)
+        assert np.array_equal(obs[0], expected[0])
+        assert obs[1:4] == expected[1:4] and obs[4]["lives"] == expected[4]["lives"]
+        ended = obs[2]
+
+
+def test_gymnasium_finds_no_fault():
+    check_env(dqn.make_env("ALE/Gopher-v5"), skip_render_check=True)
+
+
+def test_an_episode_of_thirty_minutes_is_a_time_out():
+    game = dqn.make_env("ALE/Pong-v5", obs_type="ram", frame_skip=1, noop_max=0)
+    game.emulator.setInt("max_num_frames_per_episode", 50)
+    game.reset(seed=0)
+    steps = [game.step(0) for _ in range(50)]
+    assert [step[3] for step in steps] == [False] * 49 + [True] and not any(step[2] for step in steps)
+
+
+# The replay buffer
+FRAMES, GAMES, STACK = 40, 3, 4
+
+
+def filled(tmp_path: Path, rows: int, spare: int, seed: int = 0) -> tuple[dqn.ReplayBuffer, list]:
+    """A ring through which each game's numbered frames have gone, and for each transition what it should be."""
+    buffer = dqn.ReplayBuffer(tmp_path / "replay.dat", rows, spare, GAMES, (STACK, 2))
+    rng, history, expected = np.random.default_rng(seed), [[] for _ in range(GAMES)], []
+    ages, before = np.zeros(GAMES, int), [dqn.GOES_ON] * GAMES
+    for row in range(FRAMES):
+        for game in range(GAMES):
+            frame = np.array([row, game], np.uint8)
+            history[game] = [*history[game], frame] if ages[game] else [frame]
+            follows = rng.choice([dqn.GOES_ON, dqn.ENDS], p=[0.8, 0.2])
+            if before[game] == dqn.ENDS:
+                follows = dqn.NOT_PLAYED
+            buffer.add(game, frame, ages[game], row % 5, float(row), follows)
+            padded = [history[game][0]] * STACK + history[game]
+            expected.append((row, game, np.array(padded[-STACK:]), follows))
+            ages[game] = 0 if follows == dqn.NOT_PLAYED else ages[game] + 1
+        before = [each[3] for each in expected[-GAMES:]]
+        buffer.next_row()
+    return buffer, expected
+
+
+@pytest.mark.parametrize("rows, spare", [(100, 10), (20, 5)], ids=["all", "the newest"])
+def test_what_is_drawn_is_what_was_seen(rows, spare, tmp_path):
+    buffer, expected = filled(tmp_path, rows, spare)
+    by_frame = {(row, game): (obs, follows) for row, game, obs, follows in expected}
+    minibatch = buffer.sample(4_000, 0.9, np.random.default_rng(1))
+    seen = set()
+    for obs, action, reward, discount, next_obs in zip(*map(torch.Tensor.tolist, minibatch)):
+        row, game = obs[-1]
+        wanted, follows = by_frame[row, game]
+        assert obs == wanted.tolist() and follows != dqn.NOT_PLAYED
+        assert (action, reward) == (row % 5, row)
+        assert discount == pytest.approx(0.9 if follows == dqn.GOES_ON else 0)
+        assert next_obs == by_frame[row + 1, game][0].tolist()
+        seen.add((row, game))
+    first = 0 if rows > FRAMES else FRAMES - rows + STACK - 1
+    played = {key for key, (_, follows) in by_frame.items() if follows != dqn.NOT_PLAYED}
+    assert seen == {(row, game) for row, game in played if first <= row < FRAMES - 1}
+
+
+def test_a_million_frames_take_seven_gigabytes():
+    """Each frame is there once, with seven bytes beside it: the bound that the docstring states."""
+    fields = dqn.row_type((84, 84))
+    assert fields.itemsize == 84 * 84 + 7 == 7_063
+
+
+def test_the_file_of_a_run_is_as_large_as_stated(small):
+    rows, spare = 3_000 // 4, 2 * (4_000 // 16 + 1)
+    assert (small / "replay.dat").stat().st_size == (rows + spare) * 4 * (128 + 7)
+
+
+# The network
+@pytest.mark.parametrize("shape", [(4, 84, 84), (4, 128)])
+@pytest.mark.parametrize("dueling", [True, False])
+def test_bfloat16_gives_nearly_the_same_values(shape, dueling):
+    torch.manual_seed(1)
+    network = dqn.AtariQNetwork(shape, 8, 64, dueling)
+    obs = torch.randint(0, 256, (16, *shape), dtype=torch.uint8)
+    values = network(obs)
+    network.bf16 = True
+    assert values.shape == (16, 8)
+    assert torch.allclose(network(obs), values, atol=0.01 * values.abs().max().item() + 0.005)
+
+
+def test_the_first_layer_sees_the_brightness_between_0_and_1():
+    network = dqn.AtariQNetwork((4, 84, 84), 8, 64, False)
+    obs = torch.randint(0, 256, (2, 4, 84, 84), dtype=torch.uint8)
+    x = obs / 255
+    for layer in network.trunk:
+        x = torch.relu(layer(x))
+    assert torch.allclose(network.features(obs), x.flatten(1), atol=1e-5)
+
+
+def test_an_update_is_adams_on_the_huber_loss():
+    torch.manual_seed(2)
+    args = dqn.Args(obs_type="ram", double=True)
+    learner = dqn.Learner(lambda: dqn.AtariQNetwork((1, 128), 3, 8, True), args, torch.device("cpu"))
+    with torch.no_grad():
+        for parameter in learner.target_network.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    obs, next_obs = (torch.randint(0, 256, (5, 1, 128), dtype=torch.uint8) for _ in range(2))
+    minibatch = dqn.Minibatch(obs, torch.tensor([0, 1, 2, 0, 1]), torch.randn(5), 0.9 * torch.ones(5), next_obs)
+    q, choice = learner.agent(obs), learner.agent(next_obs).argmax(1)
+    target = minibatch.returns + 0.9 * learner.target_network(next_obs)[range(5), choice].detach()
+    error = q[range(5), minibatch.actions] - target
+    loss = torch.where(error.abs() < 1, 0.5 * error**2, error.abs() - 0.5).mean()
+    gradients = torch.autograd.grad(loss, list(learner.agent.parameters()))
+    norm = torch.cat([gradient.flatten() for gradient in gradients]).norm()
+    before = [parameter.detach().clone() for parameter in learner.agent.parameters()]
+    learner.update(minibatch, 1e-3)
+    for parameter, old, gradient in zip(learner.agent.parameters(), before, gradients):
+        gradient = gradient * min(1, 10 / norm)
+        assert torch.allclose(parameter, old - 1e-3 * gradient / (gradient.abs() + 1e-8), atol=1e-6)
+
+
+def test_rewards_of_each_life():
+    lives, rewards = np.array([3, 3, 2, 2, 2, 1, 1, 0]), np.array([20, 0, 0, 100, 20, 20, 0, 0])
+    assert dqn.rewards_per_life({"lives": lives, "rewards": rewards}) == [1, 3, 0]
+    assert dqn.rewards_per_life({"lives": lives[:4], "rewards": rewards[:4]}) == [1, 1]  # a time-out within a life
+
+
+# Runs
+@pytest.fixture(scope="session")
+def small(tmp_path_factory) -> Path:
+    """An undisturbed small run."""
+    folder = tmp_path_factory.mktemp("gopher")
+    run(*SMALL, "--run-dir", "run", "--save-model", "--save-demos", 2, cwd=folder, script=SCRIPT)
+    return folder / "run"
+
+
+def assert_same_run(left: Path, right: Path) -> None:
+    for name in RECORDS:
+        assert (left / name).read_bytes() == (right / name).read_bytes(), name
+    states = [torch.load(folder / "checkpoint.pt", weights_only=True)["learner"] for folder in (left, right)]
+    for part in ("agent", "target_network"):
+        for name, value in states[0][part].items():
+            assert torch.equal(value, states[1][part][name]), name
+    for mine, other in zip(*(state["optimizer"]["state"].values() for state in states)):
+        assert all(torch.equal(value, other[name]) for name, value in mine.items())
+
+
+def rows(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def kill(flags: list, folder: Path, number: int, at_row: int) -> None:
+    """Start or resume a run and send it a signal once `episodes.csv` has `at_row` rows."""
+    line = command(*flags, "--run-dir", folder, "--resume", script=SCRIPT)
+    process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    while process.poll() is None and rows(folder / "episodes.csv") < at_row:
+        time.sleep(0.002)
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=120)
+    assert process.returncode == (-number if number == signal.SIGKILL else 128 + number), out
+
+
+def test_a_killed_run_ends_with_the_same_bytes(small, tmp_path):
+    """Killed within the episodes of four games: they are played again from their seeds."""
+    for at_row in (1, 2):
+        kill(SMALL, tmp_path / "run", signal.SIGKILL, at_row)
+    kill(SMALL, tmp_path / "run", signal.SIGTERM, 4)
+    done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    assert "differs" not in done.stderr
+    assert_same_run(small, tmp_path / "run")
+
+
+def test_a_run_on_pixels_stops_and_goes_on(tmp_path):
+    flags = ["--total-timesteps", 3_200, "--buffer-size", 500, "--learning-starts", 1_600, "--checkpoint-interval", 800]
+    flags += [
+        "--eval-episodes",
+        1,
+        "--eval-epsilon",
+        1,
+        "--bf16",
+        "--noop-max",
+        5,
+        "--life-loss-ends",
+        "--no-clip-rewards",
+    ]
+    run(*flags, "--run-dir", "whole", cwd=tmp_path, script=SCRIPT)
+    run(*flags, "--stop-at", 2_016, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    assert_same_run(tmp_path / "whole", tmp_path / "run")
+
+
+def test_updates_and_target_network_come_when_they_should(small, tmp_path):
+    """One update per 16 frames from frame 4,000 on; the target network is the network of the last multiple of 4,000."""
+    with open(small / "updates.csv", newline="") as file:
+        assert sum(int(row["charts/updates"]) for row in csv.DictReader(file)) == (20_000 - 4_000) // 16 + 1
+    states = []
+    for stop_at in (8_000, 9_000):
+        run(*SMALL, "--stop-at", stop_at, "--run-dir", "run", "--resume", cwd=tmp_path, script=SCRIPT)
+        states.append(torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["learner"])
+    for name, value in states[1]["target_network"].items():
+        assert torch.equal(value, states[0]["agent"][name])
+    assert not torch.equal(states[1]["agent"]["hidden.weight"], states[0]["agent"]["hidden.weight"])
+
+
+def test_demonstrations_can_be_played_again(small):
+    """From the seed, and from the emulator's state."""
+    manifest = json.loads((small / "demos" / "manifest.json").read_text())
+    assert manifest["env_id"] == "ALE/Gopher-v5" and len(manifest["files"]) == 2
+    for path in sorted((small / "demos").glob("*.npz")):
+        with np.load(path, allow_pickle=False) as arrays:
+            demo = dict(arrays)
+        assert demo["t_ns"][15] == pytest.approx(1e9, abs=100)
+        game = dqn.make_env(manifest["env_id"], **manifest["options"])
+        game.reset(seed=int(demo["seed"]))
+        seeded = [game.step(int(action)) for action in demo["actions"]]
+        game = dqn.make_env(manifest["env_id"], **manifest["options"])
+        game.reset(seed=0)
+        state = ale_py.ALEState.__new__(ale_py.ALEState)
+        state.__setstate__(demo["emulator_state"].tobytes())
+        game.emulator.restoreState(state)
+        restored = [game.step(int(action)) for action in demo["actions"]]
+        for steps in (seeded, restored):
+            assert np.array_equal([step[1] for step in steps], demo["rewards"])
+            assert np.array_equal([step[4]["lives"] for step in steps], demo["lives"])
+            assert steps[-1][2] == demo["terminated"]
+
+
+def test_the_model_plays_as_it_was_evaluated(small):
+    args = json.loads((small / "args.json").read_text())
+    network = dqn.AtariQNetwork((4, 128), 8, args["hidden_size"], args["dueling"], args["bf16"])
+    network.load_state_dict(safetensors.torch.load_file(small / "model.safetensors"))
+    evaluation = json.loads((small / "evaluation.json").read_text())
+    policy = dqn.epsilon_greedy_policy(dqn.greedy_policy(network, torch.device("cpu")), 8, 0.5, seed=1)
+    episodes = dqn.play(policy, lambda: dqn.make_env("ALE/Gopher-v5", obs_type="ram"), evaluation["seeds"])
+    assert [episode["rewards"].sum() for episode in episodes] == evaluation["returns"]
+
+
+def test_runs_leave_what_the_readme_says(small):
+    names = {path.name for path in small.iterdir() if "tfevents" not in path.name}
+    shared = {"args.json", "checkpoint.pt", "checkpoint.previous.pt", "evaluation.json", "learning_curve.png"}
+    assert names == {*shared, "model.safetensors", "result.json", "updates.csv", "demos", "episodes.csv", "replay.dat"}
+
+
+def test_copied_alone_into_an_empty_folder(small, tmp_path):
+    shutil.copy(SCRIPT, tmp_path)
+    run(*SMALL, "--run-dir", "run", cwd=tmp_path, script=tmp_path / SCRIPT.name, PYTHONSAFEPATH="1")
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small / "updates.csv").read_bytes()
+
+
+def test_a_video_is_recorded(tmp_path):
+    flags = [*RAM, "--total-timesteps", 3_200, "--noop-max", 0, "--capture-video", "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=SCRIPT)
+    assert len(list((tmp_path / "run" / "videos").glob("*.mp4"))) == 1
+
+
+def test_a_lost_replay_buffer_is_not_taken_for_an_empty_one(tmp_path):
+    run(*SMALL, "--stop-at", 8_000, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    (tmp_path / "run" / "replay.dat").unlink()
+    done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path, script=SCRIPT, code=1)
+    assert "replay.dat" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_resume_with_other_hyperparameters_names_them(small, tmp_path, capsys):
+    shutil.copytree(small, tmp_path / "run")
+    flags = [*SMALL, "--gamma", 0.9, "--run-dir", tmp_path / "run", "--resume"]
+    assert_refused(dqn, capsys, flags, ["--gamma 0.9", "was 0.99"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_runs_killed_at_random_end_with_the_same_bytes(small, tmp_path):
+    for seed in range(6):
+        flags = [*SMALL, "--run-dir", tmp_path / f"run{seed}"]
+        kill_twice(flags, 12, seed, SCRIPT)
+        run(*flags, "--resume", cwd=tmp_path, script=SCRIPT)
+        assert_same_run(small, tmp_path / f"run{seed}")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_it_learns_from_the_memory(tmp_path):
+    """Random play gets about 250 points."""
+    flags = ["--obs-type", "ram", "--total-timesteps", 1_000_000, "--eval-episodes", 30, "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=SCRIPT)
+    assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["mean"] > 750
