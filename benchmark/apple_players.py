@@ -80,7 +80,7 @@ def measure(method, player: str, args: Args) -> dict:
 def write_quick_demonstrations(method, args: Args) -> None:
     """Demonstrations of the synthetic human without lapses and with reactions and pauses of a few frames."""
     human = type("QuickHuman", (method.SyntheticHuman,), QUICK)
-    count = method.Args.demo_frames // method.EPISODE_FRAMES + 1
+    count = method.DEFAULTS["demo_frames"] // method.EPISODE_FRAMES + 1
     seeds = [method.episode_seed(args.seed, method.HUMAN_STREAM, i) for i in range(count)]
     episodes = method.play(human(count, args.seed), "AppleGame-v0", seeds, keep=True)
     args.demos.mkdir(parents=True, exist_ok=True)

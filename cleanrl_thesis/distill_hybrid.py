@@ -1,33 +1,40 @@
-"""Hybrid of reinforcement and imitation learning by policy distillation (thesis sections 2.3.2 and 2.4.1).
+"""Hybrid of reinforcement and imitation learning by policy distillation (thesis sections 2.3.2, 2.4.1 and 2.4.2).
 
     python cleanrl_thesis/distill_hybrid.py --teacher runs/apple_teacher             # the hybrid, α = 0.93
     python cleanrl_thesis/distill_hybrid.py --alpha 0                                # behaviour cloning of the human
     python cleanrl_thesis/distill_hybrid.py --alpha 1 --teacher runs/apple_teacher   # distillation of the DQN
     python cleanrl_thesis/distill_hybrid.py --teacher runs/apple_teacher --demos recordings/anna
+    python cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --teacher runs/gopher_teacher      # α = 0.8
 
 L_mix(π) = α E_s[− Σ_a π_RL⁽ᵀ⁾(a|s) log π(a|s)] + (1 − α) E_s[− Σ_a π_HE(a|s) log π(a|s)]: cross-entropy against the DQN's
 softmax at temperature T (soft labels) and against the human's actions (hard labels), both over the human's states.
 
-The teacher is a run of `dqn_apple.py --save-model`. The human is by default a **synthetic** one: a script with a
-reaction time, motor noise, keys that are held too long or too short, slips and lapses, calibrated to the mean of Table
-2.1's human row; it is made from no agent. `--demos` takes recordings instead. `--run-dir DIR --resume` can be sent
+The teacher is a run of `dqn_apple.py` or `dqn_gopher.py` with `--save-model`. The human is by default a **synthetic** one: a
+script with a reaction time, motor noise, keys that are held too long or too short, slips and lapses, calibrated to the mean
+of Table 2.1's or 2.2's human row; it is made from no agent. `--demos` takes recordings instead. `--run-dir DIR --resume` can be sent
 again after every crash: on the same machine the run ends with the same bytes.
 
 | setting | value | source |
 |---|---|---|
-| frames, for testing | 16,000, of them 1,500 drawn at random | section 2.4.1 |
-| Adam's learning rate, dropout, α | 1e-4, 0.5, 0.93 | section 2.4.1 |
+| frames, for testing | 16,000, of them 1,500 drawn at random; Gopher 55,000 and 5,000 | sections 2.4.1, 2.4.2 |
+| Adam's learning rate, dropout, α | 1e-4, 0.5, 0.93; Gopher 0.8 | sections 2.4.1, 2.4.2 |
 | which network is kept | the one with the best test accuracy, α · (agrees with the DQN) + (1 − α) · (with the human); the last one is evaluated too | section 2.4.1 says test accuracy |
-| T, network, batch, epochs | 0.01, 256-256 with ReLU, 64, 100 | ours, not given; benchmark/apple_alpha.sh compares T |
+| T, network, batch, epochs | 0.01, 256-256 with ReLU, in Gopher behind DQN's convolutions, 64, 100; Gopher 20 | ours, not given; benchmark/apple_alpha.sh compares T |
 | split | by frame: neighbours of a test frame are trained on; `--split episode` keeps whole episodes apart | section 2.4.1; ours |
+
+Demonstrations of Atari hold seeds and actions; their frames, 28 kB each as stacks of four, are made again in memory (1.6 GB).
+The number of rewards in each life, the unit in which Table 2.2 seems to count (see the README), is in `evaluation.json` beside
+the points.
 """
 
 # /// script
 # requires-python = ">=3.11"
 # dependencies = [
+#     "ale-py>=0.11",
 #     "gymnasium>=1.2",
 #     "matplotlib>=3.9",
 #     "numpy>=2.0",
+#     "opencv-python-headless>=4.10",
 #     "pillow>=10.1",
 #     "safetensors>=0.4",
 #     "tensorboard>=2.17",
@@ -58,6 +65,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import ale_py
+import cv2
 import gymnasium as gym
 import numpy as np
 import PIL.Image
@@ -91,6 +100,8 @@ class Args:
     """threads of torch; one is fastest for these networks and lets a sweep fill the machine with runs"""
     compile: bool = False
     """run each update step as one compiled graph (needs a C++ compiler; compiling takes seconds, once)"""
+    bf16: bool = False
+    """the student's and the DQN's convolutions in bfloat16: faster where the processor has instructions for it"""
     track: bool = False
     """also log to Weights and Biases (`pip install wandb`)"""
     wandb_project_name: str = "cleanrl-thesis"
@@ -103,8 +114,8 @@ class Args:
     """write `model.safetensors` at the end"""
     save_demos: int = 0
     """episodes of the student to write into `demos/`, one .npz each and a manifest"""
-    eval_episodes: int = 400
-    """episodes of the evaluation at the end, sampled and greedy (Table 2.1)"""
+    eval_episodes: int | None = None
+    """episodes of the evaluation at the end, sampled and greedy; default: 400 (Table 2.1), Atari 100"""
     eval_mode: Literal["sampled", "greedy"] = "sampled"
     """whether video and demonstrations sample from the policy or take its most probable action"""
     run_dir: Path | None = None
@@ -118,26 +129,26 @@ class Args:
 
     # Algorithm
     env_id: str = "AppleGame-v0"
-    """the environment: AppleGame-v0, or with `--demos` a Gymnasium id with flat Box or image observations (channels
-    first, uint8) and Discrete actions"""
+    """the environment: AppleGame-v0, ALE/Gopher-v5, or with `--demos` another ALE/*-v5 or a Gymnasium id with flat Box or
+    image observations (channels first, uint8) and Discrete actions"""
     teacher: Path | None = None
     """folder of the DQN's run, with `model.safetensors`; needed for α > 0"""
     demos: Path | None = None
     """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_synthetic_human/`"""
-    demo_frames: int = 16_000
-    """frames of the human, and with `--states own` of the DQN (section 2.4.1)"""
-    test_frames: int = 1_500
-    """frames kept for testing (section 2.4.1)"""
+    demo_frames: int | None = None
+    """frames of the human, and with `--states own` of the DQN; default: 16,000 (section 2.4.1), Atari 55,000 (2.4.2)"""
+    test_frames: int | None = None
+    """frames kept for testing; default: 1,500 (section 2.4.1), Atari 5,000 (section 2.4.2)"""
     split: Literal["frame", "episode"] = "frame"
     """draw the test set by frame (section 2.4.1) or by episode"""
-    alpha: float = 0.93
-    """α, weight of the DQN against the human (section 2.4.1)"""
+    alpha: float | None = None
+    """α, weight of the DQN against the human; default: 0.93 (section 2.4.1), Atari 0.8 (section 2.4.2)"""
     temperature: float = 0.01
     """T of the soft labels; 0 makes them hard (section 2.3.2; the value is ours)"""
     states: Literal["human", "own"] = "human"
     """states of the DQN's term: the human's, or those of the DQN's own play (section 2.3.2)"""
-    epochs: int = 100
-    """passes over the training set"""
+    epochs: int | None = None
+    """passes over the training set; default: 100, Atari 20"""
     batch_size: int = 64
     """frames per update"""
     learning_rate: float = 1e-4
@@ -146,6 +157,10 @@ class Args:
     """share of hidden units left out in training (section 2.4.1)"""
     hidden_size: int = 256
     """units in each of the two hidden layers"""
+
+
+DEFAULTS = {"demo_frames": 16_000, "test_frames": 1_500, "alpha": 0.93, "epochs": 100, "eval_episodes": 400}
+ATARI_DEFAULTS = {"demo_frames": 55_000, "test_frames": 5_000, "alpha": 0.8, "epochs": 20, "eval_episodes": 100}
 
 
 class UsageError(Exception):
@@ -180,8 +195,15 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
         raise UsageError(f"{flag} {value}".strip() + f": {allowed}")
 
 
+def is_atari(env_id: str) -> bool:
+    return env_id.startswith("ALE/")
+
+
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
+    for name, value in (ATARI_DEFAULTS if is_atari(args.env_id) else DEFAULTS).items():
+        if getattr(args, name) is None:
+            setattr(args, name, value)
     args.stop_at = args.epochs if args.stop_at is None else args.stop_at
     counts = (
         "num_threads eval_episodes checkpoint_interval stop_at demo_frames test_frames epochs batch_size hidden_size"
@@ -202,7 +224,10 @@ def complete_args(args: Args) -> Args:
     require(args.test_frames < args.demo_frames, "--test-frames", args.test_frames, allowed)
     needs_teacher = args.alpha > 0 and args.teacher is None
     require(
-        not needs_teacher, "--alpha", args.alpha, "needs --teacher, the folder of a run of dqn_apple.py --save-model"
+        not needs_teacher,
+        "--alpha",
+        args.alpha,
+        "needs --teacher, the folder of a run of dqn_apple.py or dqn_gopher.py --save-model",
     )
     together = args.states == "human" or args.teacher is not None and args.split == "frame"
     require(together, "--states", "own", "needs --teacher, and --split frame: the DQN's frames are of other episodes")
@@ -378,6 +403,112 @@ if "AppleGame-v0" not in gym.registry:
     gym.register("AppleGame-v0", AppleGameEnv, vector_entry_point=AppleGameVectorEnv)
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# Atari
+# ---------------------------------------------------------------------------------------------------------------------
+SIDE, RAM_BYTES = 84, 128
+ATARI_FPS = 60  # the console's frames a second
+
+
+class AtariGame(gym.Env):
+    """A game of ale-py as Mnih et al. (2015) show it: the last frames that the agent saw, newest last.
+
+    Observations are (frame_stack, 84, 84) uint8, or of `ram` (frame_stack, 128): equal to Gymnasium's
+    `FrameStackObservation(AtariPreprocessing(gym.make(env_id, frameskip=1), noop_max, frame_skip), frame_stack)`.
+    An episode follows from the seed of its reset and its actions. The end after 30 minutes is a truncation.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(
+        self,
+        env_id: str,
+        obs_type: str = "pixels",
+        frame_skip: int = 4,
+        frame_stack: int = 4,
+        noop_max: int = 30,
+        render_mode: str | None = None,
+    ):
+        spec = gym.spec(env_id)
+        self.render_mode, self.obs_type, self.frame_skip, self.noop_max = render_mode, obs_type, frame_skip, noop_max
+        self.metadata = {**self.metadata, "render_fps": ATARI_FPS // frame_skip}
+        self.rom = ale_py.roms.get_rom_path(spec.kwargs["game"])
+        self.emulator = ale_py.ALEInterface()
+        self.emulator.setFloat("repeat_action_probability", spec.kwargs["repeat_action_probability"])
+        self.emulator.setInt("max_num_frames_per_episode", spec.kwargs["max_num_frames_per_episode"])
+        self.emulator.loadROM(self.rom)
+        self.moves = self.emulator.getMinimalActionSet()
+        self.shape = (RAM_BYTES,) if obs_type == "ram" else (SIDE, SIDE)
+        self.screens = np.zeros((2, *self.emulator.getScreenDims()), np.uint8)
+        self.stack = np.zeros((frame_stack, *self.shape), np.uint8)
+        self.observation_space = gym.spaces.Box(0, 255, self.stack.shape, np.uint8)
+        self.action_space = gym.spaces.Discrete(len(self.moves))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        """Begin an episode; with a seed, the one that `gym.make(env_id).reset(seed=seed)` begins."""
+        if seed is not None:
+            numpy_seed, emulator_seed = np.random.SeedSequence(seed).generate_state(2)
+            self.np_random = np.random.default_rng(int(numpy_seed))
+            self.emulator.setInt("random_seed", np.int32(emulator_seed.astype(np.int32)))
+            self.emulator.loadROM(self.rom)
+        self.emulator.reset_game()
+        for _ in range(self.np_random.integers(1, self.noop_max + 1) if self.noop_max else 0):
+            self.emulator.act(self.moves[0])
+            if self.emulator.game_over():
+                self.emulator.reset_game()
+        self.lives = self.emulator.lives()
+        self.screens[1] = 0
+        self.look(0)
+        self.stack[:] = self.frame()
+        return self.stack.copy(), {"lives": self.lives}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Repeat an action for `frame_skip` frames, or until the game is over; the reward is the sum of the points."""
+        reward = 0.0
+        for left in range(self.frame_skip - 1, -1, -1):
+            reward += self.emulator.act(self.moves[action])
+            if self.emulator.game_over():
+                break
+            if left < 2:
+                self.look(left)
+        self.lives = self.emulator.lives()
+        self.stack[:-1] = self.stack[1:]
+        self.stack[-1] = self.frame()
+        terminated, truncated = self.emulator.game_over(with_truncation=False), self.emulator.game_truncated()
+        return self.stack.copy(), reward, terminated, truncated, {"lives": self.lives}
+
+    def look(self, which: int) -> None:
+        """Put the screen's greys into one of the two whose brighter pixels are seen: sprites flicker."""
+        if self.obs_type == "pixels":
+            self.emulator.getScreenGrayscale(self.screens[which])
+
+    def frame(self) -> np.ndarray:
+        """What the agent sees of the last two frames, (84, 84) or (128,) uint8."""
+        if self.obs_type == "ram":
+            return self.emulator.getRAM()
+        if self.frame_skip > 1:
+            np.maximum(self.screens[0], self.screens[1], out=self.screens[0])
+        return cv2.resize(self.screens[0], (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+
+    def render(self) -> np.ndarray:
+        return self.emulator.getScreenRGB()
+
+
+def make_atari(env_id: str, render_mode: str | None = None, **options) -> AtariGame:
+    """Make a game of ale-py, with the options of AtariGame. Raises UsageError."""
+    gym.register_envs(ale_py)
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
+    try:
+        known = gym.spec(env_id).entry_point == "ale_py.env:AtariEnv" and env_id.endswith("-v5")
+    except gym.error.Error as error:
+        raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
+    require(known, "--env-id", env_id, "must be a game of ale-py: ALE/*-v5")
+    return AtariGame(env_id, render_mode=render_mode, **options)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Environments
+# ---------------------------------------------------------------------------------------------------------------------
 def is_image(space: gym.Space) -> bool:
     """Whether observations are images, (C, H, W) uint8, large enough for the convolutions."""
     shape = space.shape if isinstance(space, gym.spaces.Box) and space.dtype == np.uint8 else ()
@@ -386,6 +517,8 @@ def is_image(space: gym.Space) -> bool:
 
 def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
     """Make an environment with flat `Box` or image observations and `Discrete` actions. Raises UsageError."""
+    if is_atari(env_id):
+        return make_atari(env_id, render_mode)
     try:
         env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True)
     except (gym.error.Error, ImportError, TypeError, ValueError) as error:
@@ -466,7 +599,82 @@ class SyntheticHuman:
         self.acts[games, axes] = self.frame + np.where(presses, holds, pauses)
 
 
-SYNTHETIC_HUMANS = {"AppleGame-v0": SyntheticHuman}
+FARMER_X, GOPHER_X, SCENE, GOPHER_Y = 31, 41, 82, 85  # bytes of the console's memory
+IN_PLAY, RISING, ABOVE_GROUND = 7, 14, 35  # values of the scene, and heights of the gopher
+HOLES = np.array([15, 31, 47, 111, 127, 143])  # where they can be, in pixels from the left
+HOLE_BYTES, HOLE_BITS = np.array([0, 1, 1, 4, 4, 5]), np.array([128, 24, 1, 24, 1, 24])  # in each of the garden's rows
+NOOP, FIRE, GO_RIGHT, GO_LEFT, RIGHT_FIRE, LEFT_FIRE = 0, 1, 3, 4, 6, 7
+ROWS, ROW_BYTES = 3, 6  # of the garden above the tunnel, from the surface down
+SHOVEL, BONK = 4, 3  # how far right of a hole, or of the gopher, the farmer has to stand
+
+
+class SyntheticGopherHuman:
+    """A scripted player of Gopher with a person's limits; it is made from no agent, and reads the console's memory.
+
+    It sees everything late, but knows where its own hands are. It runs to where the gopher comes up, else to the deepest hole
+    nearby, stops a little off, and taps the button; now and then its mind is elsewhere. Calibrated by hand to the mean of
+    Table 2.2's human row, in rewards per life: see benchmark/gopher_players.py.
+    """
+
+    reaction = 4  # how late it sees, in actions of 4 frames: 267 ms
+    aim_error = 2.0  # deviation of the place where it wants to stand, in pixels, for each new aim
+    close_enough = 3.0  # pixels from there
+    taps = (2, 5)  # actions from one press of the button to the next, at least, and at most one less
+    lapse, lapse_actions = 0.005, 8.0  # how often the mind is elsewhere, per action, and for how many on average
+
+    def __init__(self, seed: int, episode: int):
+        self.rng = np.random.default_rng(np.random.SeedSequence([seed, HUMAN_STREAM, episode]))
+        self.seen: list[np.ndarray] = []  # the memory at the last actions, oldest first
+        self.aim, self.error = None, 0.0
+        self.actions, self.next_tap, self.awake_at = 0, 0, 0
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        """The console's memory (1, 1, 128) -> action (1,)."""
+        memory = obs[0, -1].astype(int)
+        self.seen = [*self.seen, memory][-self.reaction - 2 :]
+        self.actions += 1
+        late = max(0, len(self.seen) - 1 - self.reaction)
+        return np.array([self.act(int(memory[FARMER_X]), self.seen[max(0, late - 1)], self.seen[late])])
+
+    def act(self, farmer: int, earlier: np.ndarray, late: np.ndarray) -> int:
+        """The action, by what was seen `reaction` actions ago, and one before."""
+        if self.actions < self.awake_at:
+            return NOOP
+        if self.rng.random() < self.lapse:
+            self.awake_at = self.actions + self.rng.exponential(self.lapse_actions)
+        if late[SCENE] != IN_PLAY:
+            return self.tap(NOOP)
+        aim, place, reach = self.choose(farmer, earlier, late)
+        if aim != self.aim:
+            self.aim, self.error = aim, self.rng.normal(0, self.aim_error)
+        way = place + self.error - farmer
+        move = NOOP if abs(way) <= self.close_enough else GO_RIGHT if way > 0 else GO_LEFT
+        return self.tap(move) if abs(place - farmer) <= reach else move
+
+    def choose(self, farmer: int, earlier: np.ndarray, late: np.ndarray) -> tuple[str | int, float, float]:
+        """What it is about, where the farmer should stand for it, and from how far away it begins to tap."""
+        height, gopher = late[GOPHER_Y], late[GOPHER_X]
+        speed = gopher - earlier[GOPHER_X] if abs(gopher - earlier[GOPHER_X]) < 20 else 0
+        garden = late[: ROWS * ROW_BYTES].reshape(ROWS, ROW_BYTES)
+        depths = ((garden[:, HOLE_BYTES] & HOLE_BITS) > 0).sum(0)  # rows that are dug, of each hole
+        if height >= ABOVE_GROUND:
+            return "running", gopher + speed * self.reaction + BONK, 9
+        if height >= RISING and depths[np.abs(HOLES - gopher).argmin()] == ROWS:
+            return "rising", gopher + BONK, 6 if height >= ABOVE_GROUND - 5 else -1
+        if depths.max() > 0:
+            hole = int((depths - np.abs(HOLES + SHOVEL - farmer) / 60).argmax())
+            return hole, HOLES[hole] + SHOVEL, 4
+        return "nothing", 80, -1
+
+    def tap(self, move: int) -> int:
+        """Press the button besides, if it is time to."""
+        if self.actions < self.next_tap:
+            return move
+        self.next_tap = self.actions + self.rng.integers(*self.taps)
+        return {NOOP: FIRE, GO_RIGHT: RIGHT_FIRE, GO_LEFT: LEFT_FIRE}[move]
+
+
+SYNTHETIC_HUMANS = {"AppleGame-v0": SyntheticHuman, "ALE/Gopher-v5": SyntheticGopherHuman}
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -485,6 +693,10 @@ def episode_seeds(seed: int, stream: int, block: int) -> list[int]:
 def episode_seed(seed: int, stream: int, episode: int) -> int:
     """Seed of an episode: sub-environment `stream` of run `seed`, or one of the streams that are not trained on."""
     return episode_seeds(seed, stream, episode // 256)[episode % 256]
+
+
+ATARI_SKIP, ATARI_EPSILON = 4, 0.01  # frames of an action; random actions of greedy players, who could wait forever
+RECORDED = {"frame_skip": ATARI_SKIP, "noop_max": 30}  # options of AtariGame that demonstrations have to share
 
 
 class Frames(NamedTuple):
@@ -512,11 +724,30 @@ def read_episode(path: Path, checksum: str, env: gym.Env) -> dict[str, np.ndarra
         raise UsageError(f"--demos {path}: cannot be read: {error.strerror}") from None
     same = hashlib.sha256(content).hexdigest() == checksum
     require(same, "--demos", path, "its SHA-256 is not the manifest's, the file was changed or damaged")
+    atari = isinstance(env, AtariGame)
+    names = ("actions", "rewards", *(("lives", "seed", "emulator_state") if atari else ("observations",)))
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            observations, actions, rewards = arrays["observations"], arrays["actions"], arrays["rewards"]
+            episode = {name: arrays[name] for name in names}
     except (KeyError, ValueError, TypeError, zipfile.BadZipFile, EOFError, OSError) as error:
         raise UsageError(f"--demos {path}: no demonstration: {first_line(error)}") from None
+    actions, rewards, number = episode["actions"], episode["rewards"], int(env.action_space.n)
+    if not atari:
+        check_observations(path, episode["observations"], actions, env)
+    inside = np.issubdtype(actions.dtype, np.integer) and bool(((actions >= 0) & (actions < number)).all())
+    require(inside, "--demos", path, f"actions must be whole numbers from 0 to {number - 1}")
+    scored = np.issubdtype(rewards.dtype, np.number) and rewards.shape == actions.shape and np.isfinite(rewards).all()
+    require(bool(scored), "--demos", path, "rewards must be finite numbers (T,)")
+    if atari:
+        require(actions.ndim == 1 and episode["seed"].shape == (), "--demos", path, "needs actions (T,) and one seed")
+        episode["observations"] = watch(env, episode)
+        allowed = "gives other rewards when it is played again: of another version of ale-py?"
+        require(episode["observations"] is not None, "--demos", path, allowed)
+    return episode
+
+
+def check_observations(path: Path, observations: np.ndarray, actions: np.ndarray, env: gym.Env) -> None:
+    """Raise UsageError where they do not fit actions and environment."""
     shape = env.observation_space.shape
     fits = actions.ndim == 1 and observations.shape == (len(actions) + 1, *shape)
     allowed = f"observations must be (T + 1, {', '.join(map(str, shape))}) and actions (T,), they are"
@@ -525,12 +756,18 @@ def read_episode(path: Path, checksum: str, env: gym.Env) -> dict[str, np.ndarra
     require(finite, "--demos", path, "observations must be finite numbers")
     same_kind = not is_image(env.observation_space) or observations.dtype == np.uint8
     require(same_kind, "--demos", path, f"observations must be uint8, they are {observations.dtype}")
-    number = int(env.action_space.n)
-    inside = np.issubdtype(actions.dtype, np.integer) and bool(((actions >= 0) & (actions < number)).all())
-    require(inside, "--demos", path, f"actions must be whole numbers from 0 to {number - 1}")
-    scored = np.issubdtype(rewards.dtype, np.number) and rewards.shape == actions.shape and np.isfinite(rewards).all()
-    require(bool(scored), "--demos", path, "rewards must be finite numbers (T,)")
-    return {"observations": observations, "actions": actions, "rewards": rewards}
+
+
+def watch(game: AtariGame, episode: dict[str, np.ndarray]) -> np.ndarray | None:
+    """What a game shows when an episode is played again, (T + 1, S, 84, 84); None where it goes another way."""
+    observations = [game.reset(seed=int(episode["seed"]))[0]]
+    state = game.emulator.cloneState(include_rng=True).__getstate__()
+    same = state == episode["emulator_state"].tobytes()
+    for action, reward in zip(episode["actions"].tolist(), episode["rewards"].tolist()):
+        obs, points, _, _, _ = game.step(action)
+        observations.append(obs)
+        same = same and points == reward
+    return np.stack(observations) if same else None
 
 
 def read_demonstrations(folder: Path, env_id: str) -> list[dict[str, np.ndarray]]:
@@ -545,15 +782,33 @@ def read_demonstrations(folder: Path, env_id: str) -> list[dict[str, np.ndarray]
     same_game = recorded.split(":")[-1] == env_id.split(":")[-1]
     require(same_game, "--demos", folder, f"was recorded in {recorded}, --env-id is {env_id}")
     env = make_env(env_id)
+    if is_atari(env_id):
+        options = manifest.get("options") or {}
+        same = all(options.get(name) == value for name, value in RECORDED.items())
+        require(same, "--demos", folder, f"was recorded with {options}, needs {RECORDED}")
     return [read_episode(folder / name, checksum, env) for name, checksum in sorted(files.items())]
 
 
 def make_human_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
     """Episodes of the synthetic human, enough for `--demo-frames`."""
+    if is_atari(args.env_id):
+        return make_gopher_demonstrations(args)
     count = math.ceil(args.demo_frames / EPISODE_FRAMES)
     seeds = [episode_seed(args.seed, HUMAN_STREAM, i) for i in range(count)]
     human = SYNTHETIC_HUMANS[args.env_id.split(":")[-1]](count, args.seed)
     return play(human, args.env_id, seeds, keep=True)
+
+
+def make_gopher_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
+    """The same in Gopher: the human reads the memory, then each episode is played again for its frames."""
+    episodes, frames, game = [], 0, make_env(args.env_id)
+    make_game = functools.partial(make_atari, args.env_id, obs_type="ram", frame_stack=1)
+    while frames < args.demo_frames:
+        human = SYNTHETIC_HUMANS[args.env_id](args.seed, len(episodes))
+        episode = play_atari(human, make_game, [episode_seed(args.seed, HUMAN_STREAM, len(episodes))])[0]
+        episodes.append({**episode, "observations": watch(game, episode)})
+        frames += len(episode["actions"])
+    return episodes
 
 
 class QNetwork(nn.Module):
@@ -597,24 +852,94 @@ def numpy_greedy(agent: QNetwork):
     return greedy
 
 
-def load_teacher(folder: Path, env_id: str) -> QNetwork:
-    """The network of a run of dqn_apple.py. Raises UsageError."""
-    path = folder / "model.safetensors"
-    require(path.exists(), "--teacher", folder, "has no model.safetensors; train it with dqn_apple.py --save-model")
+class AtariQNetwork(nn.Module):
+    """Q(s, ·) of each action: convolutions (for the memory's bytes two layers), a hidden layer, one linear head.
+
+    With `dueling` two heads, each on one half of the hidden layer: V(s) + A(s, ·) − mean A.
+    """
+
+    def __init__(
+        self, obs_shape: tuple[int, ...], num_actions: int, hidden_size: int, dueling: bool, bf16: bool = False
+    ):
+        super().__init__()
+        self.bf16, self.head_size = bf16, (hidden_size // 2 if dueling else hidden_size)
+        if len(obs_shape) == 3:
+            layers = nn.Conv2d(obs_shape[0], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)
+        else:
+            layers = nn.Linear(math.prod(obs_shape), 256), nn.Linear(256, 256)
+        self.trunk = nn.ModuleList(layers)
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            features = self.features(torch.zeros(1, *obs_shape)).shape[1]
+        self.hidden = nn.Linear(features, hidden_size)
+        self.advantage = nn.Linear(self.head_size, num_actions)
+        self.value = nn.Linear(self.head_size, 1) if dueling else None
+
+    def features(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (B, S, 84, 84) or (B, S, 128) of 0 to 255 -> features (B, F)."""
+        first, *others = self.trunk
+        x = obs.to(torch.bfloat16 if self.bf16 else torch.float32)  # exact: bfloat16 has all integers up to 256
+        weight = first.weight / 255  # instead of the observations, which are more
+        if obs.ndim == 4:  # channels last in memory, which is faster
+            x = F.conv2d(x.contiguous(memory_format=torch.channels_last), weight, first.bias, first.stride)
+        else:
+            x = F.linear(x.flatten(1), weight, first.bias)
+        for layer in others:
+            x = layer(torch.relu(x))
+        return torch.relu(x).flatten(1)
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (B, S, 84, 84) or (B, S, 128) uint8 -> action values (B, A)."""
+        with torch.autocast(obs.device.type, torch.bfloat16, enabled=self.bf16):
+            hidden = torch.relu(self.hidden(self.features(obs)))
+        hidden = hidden.float()
+        advantage = self.advantage(hidden[:, -self.head_size :])
+        if self.value is None:
+            return advantage
+        return self.value(hidden[:, : self.head_size]) + advantage - advantage.mean(1, keepdim=True)
+
+
+def greedy_policy(agent: AtariQNetwork, device: torch.device):
+    """argmax Q as a numpy function, observations (N, ...) uint8 -> actions (N,)."""
+
+    def greedy(obs: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return agent(torch.from_numpy(obs).to(device)).argmax(1).cpu().numpy()
+
+    return greedy
+
+
+def epsilon_greedy_policy(greedy, num_actions: int, epsilon: float, seed: int):
+    """The greedy policy with a share of random actions."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, EVALUATION_STREAM]))
+
+    def policy(obs: np.ndarray) -> np.ndarray:
+        random_actions = rng.integers(num_actions, size=len(obs))
+        return np.where(rng.random(len(obs)) < epsilon, random_actions, greedy(obs))
+
+    return policy
+
+
+def load_teacher(folder: Path, env_id: str, bf16: bool = False) -> QNetwork | AtariQNetwork:
+    """The network of a run of dqn_apple.py, or for Atari of dqn_gopher.py. Raises UsageError."""
+    path, script = folder / "model.safetensors", "dqn_gopher.py" if is_atari(env_id) else "dqn_apple.py"
+    require(path.exists(), "--teacher", folder, f"has no model.safetensors; train it with {script} --save-model")
     try:
         with safetensors.safe_open(path, "pt") as file:
             args = json.loads(file.metadata()["args"])
         trained_on = str(args["env_id"])
     except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"--teacher {path}: is no model of dqn_apple.py: {first_line(error)}") from None
+        raise UsageError(f"--teacher {path}: is no model of {script}: {first_line(error)}") from None
     same_game = trained_on.split(":")[-1] == env_id.split(":")[-1]
     require(same_game, "--teacher", folder, f"was trained on {trained_on}, --env-id is {env_id}")
-    skip = args.get("frame_skip")
-    require(skip == 1, "--teacher", folder, f"acts once in {skip} frames, the student acts in each")
+    skip, own_skip = args.get("frame_skip"), ATARI_SKIP if is_atari(env_id) else 1
+    require(skip == own_skip, "--teacher", folder, f"acts once in {skip} frames, the student in {own_skip}")
     env = make_env(env_id)
     try:
-        shape = env.observation_space.shape[0], int(env.action_space.n), args["hidden_size"]
-        teacher = QNetwork(*shape, args["dueling"])
+        shape, num_actions = env.observation_space.shape, int(env.action_space.n)
+        if is_atari(env_id):
+            teacher = AtariQNetwork(shape, num_actions, args["hidden_size"], args["dueling"], bf16)
+        else:
+            teacher = QNetwork(shape[0], num_actions, args["hidden_size"], args["dueling"])
         teacher.load_state_dict(safetensors.torch.load_file(path))
     except (safetensors.SafetensorError, KeyError, TypeError, RuntimeError) as error:
         raise UsageError(f"--teacher {path}: its network has another shape: {first_line(error)}") from None
@@ -633,9 +958,9 @@ def convolutions(channels: int) -> nn.Sequential:
 class Student(nn.Module):
     """π(a|s) as a network of two hidden layers, over convolutions where observations are images."""
 
-    def __init__(self, obs_shape: tuple[int, ...], num_actions: int, hidden_size: int):
+    def __init__(self, obs_shape: tuple[int, ...], num_actions: int, hidden_size: int, bf16: bool = False):
         super().__init__()
-        self.convolutions, features = None, obs_shape[0]
+        self.convolutions, features, self.bf16 = None, obs_shape[0], bf16
         if len(obs_shape) == 3:
             self.convolutions = convolutions(obs_shape[0])
             features = self.convolutions(torch.zeros(1, *obs_shape)).shape[1]
@@ -646,8 +971,10 @@ class Student(nn.Module):
     def forward(self, obs: torch.Tensor, masks: torch.Tensor | None = None) -> torch.Tensor:
         """Observations (M, O), or (M, C, H, W) uint8 -> logits (M, A); `masks` (2, M, H) multiply the hidden units."""
         first, second, output = self.layers
-        features = obs.float() if self.convolutions is None else self.convolutions(obs / 255)
-        hidden = torch.relu(first(features))
+        with torch.autocast(obs.device.type, torch.bfloat16, enabled=self.bf16):
+            features = obs.float() if self.convolutions is None else self.convolutions(obs / 255)
+            hidden = torch.relu(first(features))
+        hidden = hidden.float()
         hidden = torch.relu(second(hidden if masks is None else hidden * masks[0]))
         return output(hidden if masks is None else hidden * masks[1])
 
@@ -685,8 +1012,15 @@ class Data(NamedTuple):
     he_actions: torch.Tensor  # (F,)
 
     def at(self, frames: torch.Tensor) -> "Data":
-        """The frames of the given indices."""
-        return Data(*(column[frames] for column in self))
+        """The frames of the given indices, or where a mask says so."""
+        he_obs = self.he_obs[frames]
+        rl_obs = he_obs if self.rl_obs is self.he_obs else self.rl_obs[frames]
+        return Data(rl_obs, self.rl_labels[frames], he_obs, self.he_actions[frames])
+
+    def to(self, device: torch.device) -> "Data":
+        he_obs = self.he_obs.to(device)
+        rl_obs = he_obs if self.rl_obs is self.he_obs else self.rl_obs.to(device)
+        return Data(rl_obs, self.rl_labels.to(device), he_obs, self.he_actions.to(device))
 
 
 def split_frames(episodes: np.ndarray, test_frames: int, by: str, rng: np.random.Generator) -> np.ndarray:
@@ -1013,6 +1347,51 @@ def play(policy, env_id: str, seeds: list[int], frame_skip: int = 1, keep: bool 
     return episodes
 
 
+GAMES_AT_ONCE = 16
+
+
+def play_atari(policy, make_game, seeds: list[int]) -> list[dict[str, np.ndarray]]:
+    """One episode for each seed, up to 16 side by side, by a function from observations (N, ...) to actions (N,).
+
+    Returns for each `actions`, `rewards` and `lives` (T,), `terminated`, `truncated`, `seed`, and `emulator_state` before the
+    first action, as bytes.
+    """
+    games, episodes = [make_game() for _ in range(min(GAMES_AT_ONCE, len(seeds)))], []
+    for block in range(0, len(seeds), GAMES_AT_ONCE):
+        episodes += play_together(policy, games, seeds[block : block + GAMES_AT_ONCE])
+    return episodes
+
+
+def play_together(policy, games: list[AtariGame], seeds: list[int]) -> list[dict[str, np.ndarray]]:
+    """One episode for each seed, each in a game of its own; see `play_atari`."""
+    obs = [game.reset(seed=seed)[0] for game, seed in zip(games, seeds)]
+    episodes = [{"seed": np.array(seed)} for seed in seeds]
+    for game, episode in zip(games, episodes):
+        state = game.emulator.cloneState(include_rng=True).__getstate__()
+        episode["emulator_state"] = np.frombuffer(state, np.uint8)
+    steps, running = [[] for _ in seeds], list(range(len(seeds)))
+    while running:
+        actions = policy(np.stack([obs[i] for i in running]))
+        for i, action in zip(tuple(running), actions.tolist()):
+            obs[i], reward, terminated, truncated, info = games[i].step(action)
+            steps[i].append((action, reward, info["lives"]))
+            if terminated or truncated:
+                running.remove(i)
+                episodes[i] |= {"terminated": np.array(terminated), "truncated": np.array(truncated)}
+    for episode, columns in zip(episodes, steps):
+        for name, column, dtype in zip(
+            ("actions", "rewards", "lives"), zip(*columns), (np.int64, np.float64, np.int64)
+        ):
+            episode[name] = np.array(column, dtype)
+    return episodes
+
+
+def rewards_per_life(episode: dict[str, np.ndarray]) -> list[int]:
+    """How many rewards there were in each life of an episode: as Table 2.2 seems to count, see the README."""
+    lost = np.flatnonzero(np.diff(episode["lives"]) < 0) + 2  # behind the step in which it was lost
+    return [int((part > 0).sum()) for part in np.split(episode["rewards"], lost) if len(part)]
+
+
 def check_video(env_id: str) -> None:
     """Raise UsageError where the environment cannot be drawn, before hours are spent on training."""
     try:
@@ -1051,6 +1430,16 @@ def record_video(student: Student, args: Args, run_dir: Path, seed: int) -> None
     env.close()
 
 
+def play_student(student: Student, mode: str, args: Args, seeds: list[int], keep: bool = False) -> list[dict]:
+    """One episode of the student for each seed; see `play` and `play_atari`."""
+    policy = numpy_policy(student, mode, args.seed)
+    if not is_atari(args.env_id):
+        return play(policy, args.env_id, seeds, keep=keep)
+    if mode == "greedy":
+        policy = epsilon_greedy_policy(policy, student.layers[-1].out_features, ATARI_EPSILON, args.seed)
+    return play_atari(policy, functools.partial(make_env, args.env_id), seeds)
+
+
 def evaluate(student: Student, update: Update, networks: dict[str, torch.Tensor], args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes with each network in each mode; write `evaluation.json` and, if asked, a video.
 
@@ -1061,9 +1450,12 @@ def evaluate(student: Student, update: Update, networks: dict[str, torch.Tensor]
     for name, vector in networks.items():
         update.vector.copy_(vector)
         for mode in ("sampled", "greedy"):
-            episodes = play(numpy_policy(student, mode, args.seed), args.env_id, seeds)
+            episodes = play_student(student, mode, args, seeds)
             returns = [float(episode["rewards"].sum()) for episode in episodes]
             evaluation[name + mode] = {"mode": mode, **summary(returns), "returns": returns}
+            if is_atari(args.env_id):
+                lives = [score for episode in episodes for score in rewards_per_life(episode)]
+                evaluation[name + mode] |= {"rewards_per_life": summary(lives), "lives": lives}
     if args.capture_video:
         record_video(student, args, run_dir, seeds[0])
     write_json(run_dir / "evaluation.json", evaluation)
@@ -1080,9 +1472,18 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 def save_demonstrations(student: Student, args: Args, run_dir: Path) -> None:
     """Write `--save-demos` episodes of the student into `demos/`."""
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
-    episodes = play(numpy_policy(student, args.eval_mode, args.seed), args.env_id, seeds, keep=True)
+    episodes = play_student(student, args.eval_mode, args, seeds, keep=True)
     about = {"env_id": args.env_id, "player": f"{args.exp_name}, alpha {args.alpha}", "mode": args.eval_mode}
-    write_demonstrations(run_dir / "demos", episodes, about)
+    save_episodes(run_dir / "demos", episodes, about)
+
+
+def save_episodes(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
+    """Write demonstrations in the form of their environment: those of Atari without observations."""
+    if is_atari(about["env_id"]):
+        without = [{name: column for name, column in each.items() if name != "observations"} for each in episodes]
+        write_atari_demonstrations(folder, without, {**about, "options": RECORDED})
+    else:
+        write_demonstrations(folder, episodes, about)
 
 
 def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
@@ -1094,6 +1495,23 @@ def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], ab
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))
     manifest = {"version": 1, **about, "files": {}}
+    for i, episode in enumerate(episodes):
+        content = io.BytesIO()
+        np.savez(content, **episode, t_ns=np.arange(len(episode["rewards"]), dtype=np.int64) * step_ns)
+        write_whole(folder / f"episode_{i:05d}.npz", content.getvalue())
+        manifest["files"][f"episode_{i:05d}.npz"] = hashlib.sha256(content.getvalue()).hexdigest()
+    write_json(folder / "manifest.json", manifest)
+
+
+def write_atari_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
+    """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
+
+    Each file has actions (T,), rewards (T,), lives (T,), terminated, truncated, seed, emulator_state, and t_ns (T,), the time of
+    each action in nanoseconds of the game. Observations are not stored: emulator and actions give them again.
+    """
+    folder.mkdir(exist_ok=True)
+    step_ns = round(1e9 * about["options"]["frame_skip"] / ATARI_FPS)
+    manifest = {"version": 1, **about, "ale_py": ale_py.__version__, "files": {}}
     for i, episode in enumerate(episodes):
         content = io.BytesIO()
         np.savez(content, **episode, t_ns=np.arange(len(episode["rewards"]), dtype=np.int64) * step_ns)
@@ -1177,13 +1595,26 @@ def label_frames(human: Frames, teacher: QNetwork | None, args: Args) -> Data:
         return Data(he_obs, torch.zeros(len(he_obs), num_actions), he_obs, he_actions)
     rl_obs = he_obs
     if args.states == "own":
-        episodes: list[dict[str, np.ndarray]] = []
-        while sum(len(episode["actions"]) for episode in episodes) < len(he_obs):
-            seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, len(episodes) + i) for i in range(10)]
-            episodes += play(numpy_greedy(teacher), args.env_id, seeds, keep=True)
-        rl_obs = torch.from_numpy(join_frames(episodes, len(he_obs)).obs)
+        rl_obs = torch.from_numpy(join_frames(play_teacher(teacher, len(he_obs), args), len(he_obs)).obs)
     with torch.no_grad():
-        return Data(rl_obs, soft_labels(teacher(rl_obs), args.temperature), he_obs, he_actions)
+        q_values = torch.cat([teacher(part) for part in rl_obs.split(5_000)])
+    return Data(rl_obs, soft_labels(q_values, args.temperature), he_obs, he_actions)
+
+
+def play_teacher(teacher: QNetwork | AtariQNetwork, frames: int, args: Args) -> list[dict[str, np.ndarray]]:
+    """Episodes of the DQN, of so many frames at least; in Atari with a hundredth of random actions."""
+    episodes: list[dict[str, np.ndarray]] = []
+    while sum(len(episode["actions"]) for episode in episodes) < frames:
+        seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, len(episodes) + i) for i in range(10)]
+        if is_atari(args.env_id):
+            policy = greedy_policy(teacher, torch.device("cpu"))
+            policy = epsilon_greedy_policy(policy, teacher.advantage.out_features, ATARI_EPSILON, seeds[0])
+            new = play_atari(policy, functools.partial(make_env, args.env_id), seeds)
+            game = make_env(args.env_id)
+            episodes += [{**episode, "observations": watch(game, episode)} for episode in new]
+        else:
+            episodes += play(numpy_greedy(teacher), args.env_id, seeds, keep=True)
+    return episodes
 
 
 def fingerprint(human: Frames, teacher: QNetwork | None) -> str:
@@ -1213,7 +1644,7 @@ def main(args: Args) -> int:
     make_env(args.env_id).close()
     if args.capture_video:
         check_video(args.env_id)
-    teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id)
+    teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id, args.bf16)
     human_episodes = read_human(args)
     torch.set_num_threads(args.num_threads)
     human = join_frames(human_episodes, args.demo_frames)
@@ -1222,8 +1653,8 @@ def main(args: Args) -> int:
     is_test = torch.from_numpy(split_frames(human.episodes, args.test_frames, args.split, split_rng))
     require(not is_test.all(), "--split", args.split, f"leaves no episode to train on, with {args.test_frames} to test")
     run_dir, checkpoint = open_run_dir(args)
-    last_epoch = min(args.epochs, args.stop_at)
-    same_data = checkpoint is None or checkpoint["data"] == fingerprint(human, teacher)
+    last_epoch, learned_from = min(args.epochs, args.stop_at), fingerprint(human, teacher)
+    same_data = checkpoint is None or checkpoint["data"] == learned_from
     require(same_data, "--resume", run_dir, "demonstrations or teacher are no longer those that the run began with")
     if is_done(run_dir, args, last_epoch):
         print(f"{run_dir} is done")
@@ -1234,7 +1665,7 @@ def main(args: Args) -> int:
     print(run_dir)
     if args.demos is None:
         about = {"env_id": args.env_id, "player": "synthetic human", "mode": "scripted"}
-        write_demonstrations(run_dir / "demos_synthetic_human", human_episodes, about)
+        save_episodes(run_dir / "demos_synthetic_human", human_episodes, about)
 
     random.seed(args.seed)  # this file draws from neither; for environments that do
     np.random.seed(args.seed)
@@ -1245,8 +1676,9 @@ def main(args: Args) -> int:
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     stop = StopSignal()
 
-    training, test = (Data(*(column[rows].to(device) for column in data)) for rows in (~is_test, is_test))
-    student = Student(tuple(data.he_obs.shape[1:]), data.rl_labels.shape[1], args.hidden_size).to(device)
+    training, test = (data.at(rows).to(device) for rows in (~is_test, is_test))
+    shapes = tuple(data.he_obs.shape[1:]), data.rl_labels.shape[1], args.hidden_size
+    student = Student(*shapes, args.bf16).to(device)
     update = Update(student, args, training.at(torch.arange(min(args.batch_size, len(training.he_obs)))))
     arithmetic = f"{'compiled' if update.is_compiled else 'plain'} on {device.type}"
     best = {"vector": update.vector.clone(), "accuracy": -1.0, "epoch": 0, **dict.fromkeys(("rl", "human"), 0.0)}
@@ -1285,7 +1717,7 @@ def main(args: Args) -> int:
             state = {
                 "args": arguments(args),
                 "arithmetic": arithmetic,
-                "data": fingerprint(human, teacher),
+                "data": learned_from,
                 "epoch": epoch,
                 "training_seconds": training_seconds,
                 "offset": updates_csv.sync(),
@@ -1348,7 +1780,8 @@ def finish_run(
             "accuracy_human": best["human"],
         },
         "evaluation": {
-            mode: {name: value for name, value in evaluation[mode].items() if name != "returns"} for mode in modes
+            mode: {name: value for name, value in evaluation[mode].items() if name not in ("returns", "lives")}
+            for mode in modes
         },
         "training_seconds": seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

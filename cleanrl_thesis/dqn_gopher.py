@@ -239,7 +239,7 @@ def complete_args(args: Args) -> Args:
 # The game
 # ---------------------------------------------------------------------------------------------------------------------
 SIDE, RAM_BYTES = 84, 128
-FPS = 60  # the console's frames a second
+ATARI_FPS = 60  # the console's frames a second
 
 
 class AtariGame(gym.Env):
@@ -263,7 +263,7 @@ class AtariGame(gym.Env):
     ):
         spec = gym.spec(env_id)
         self.render_mode, self.obs_type, self.frame_skip, self.noop_max = render_mode, obs_type, frame_skip, noop_max
-        self.metadata = {**self.metadata, "render_fps": FPS // frame_skip}
+        self.metadata = {**self.metadata, "render_fps": ATARI_FPS // frame_skip}
         self.rom = ale_py.roms.get_rom_path(spec.kwargs["game"])
         self.emulator = ale_py.ALEInterface()
         self.emulator.setFloat("repeat_action_probability", spec.kwargs["repeat_action_probability"])
@@ -326,15 +326,15 @@ class AtariGame(gym.Env):
         return self.emulator.getScreenRGB()
 
 
-def make_env(env_id: str, render_mode: str | None = None, **options) -> AtariGame:
+def make_atari(env_id: str, render_mode: str | None = None, **options) -> AtariGame:
     """Make a game of ale-py, with the options of AtariGame. Raises UsageError."""
     gym.register_envs(ale_py)
     ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
     try:
-        is_atari = gym.spec(env_id).entry_point == "ale_py.env:AtariEnv" and env_id.endswith("-v5")
+        known = gym.spec(env_id).entry_point == "ale_py.env:AtariEnv" and env_id.endswith("-v5")
     except gym.error.Error as error:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
-    require(is_atari, "--env-id", env_id, "must be a game of ale-py: ALE/*-v5")
+    require(known, "--env-id", env_id, "must be a game of ale-py: ALE/*-v5")
     return AtariGame(env_id, render_mode=render_mode, **options)
 
 
@@ -810,45 +810,46 @@ class StopSignal:
 GAMES_AT_ONCE = 16
 
 
-def play(policy, make_game, seeds: list[int], keep: bool = False) -> list[dict[str, np.ndarray]]:
-    """One episode for each seed, 16 side by side, by a function from observations (N, ...) to actions (N,).
+def play_atari(policy, make_game, seeds: list[int]) -> list[dict[str, np.ndarray]]:
+    """One episode for each seed, up to 16 side by side, by a function from observations (N, ...) to actions (N,).
 
-    Returns for each `rewards` (T,), `lives` (T,), `terminated`, `truncated` and `seed`; with `keep` also `actions` (T,)
-    and `emulator_state` (bytes as uint8), the emulator before the first of them.
+    Returns for each `actions`, `rewards` and `lives` (T,), `terminated`, `truncated`, `seed`, and `emulator_state` before the
+    first action, as bytes.
     """
-    episodes, waiting, playing = {}, list(enumerate(seeds)), []
-    spare = [make_game() for _ in range(min(GAMES_AT_ONCE, len(seeds)))]
-    while waiting or playing:
-        while waiting and spare:
-            number, seed = waiting.pop(0)
-            game = spare.pop()
-            obs, _ = game.reset(seed=seed)
-            episode = {"rewards": [], "lives": [], "actions": [], "seed": np.array(seed)}
-            if keep:
-                state = game.emulator.cloneState(include_rng=True).__getstate__()
-                episode["emulator_state"] = np.frombuffer(state, np.uint8)
-            playing.append((number, game, obs, episode))
-        actions = policy(np.stack([obs for _, _, obs, _ in playing]))
-        going_on = []
-        for (number, game, _, episode), action in zip(playing, actions):
-            obs, reward, terminated, truncated, info = game.step(int(action))
-            for name, value in (("rewards", reward), ("lives", info["lives"]), ("actions", int(action))):
-                episode[name].append(value)
+    games, episodes = [make_game() for _ in range(min(GAMES_AT_ONCE, len(seeds)))], []
+    for block in range(0, len(seeds), GAMES_AT_ONCE):
+        episodes += play_together(policy, games, seeds[block : block + GAMES_AT_ONCE])
+    return episodes
+
+
+def play_together(policy, games: list[AtariGame], seeds: list[int]) -> list[dict[str, np.ndarray]]:
+    """One episode for each seed, each in a game of its own; see `play_atari`."""
+    obs = [game.reset(seed=seed)[0] for game, seed in zip(games, seeds)]
+    episodes = [{"seed": np.array(seed)} for seed in seeds]
+    for game, episode in zip(games, episodes):
+        state = game.emulator.cloneState(include_rng=True).__getstate__()
+        episode["emulator_state"] = np.frombuffer(state, np.uint8)
+    steps, running = [[] for _ in seeds], list(range(len(seeds)))
+    while running:
+        actions = policy(np.stack([obs[i] for i in running]))
+        for i, action in zip(tuple(running), actions.tolist()):
+            obs[i], reward, terminated, truncated, info = games[i].step(action)
+            steps[i].append((action, reward, info["lives"]))
             if terminated or truncated:
-                columns = {"rewards": np.float64, "lives": np.int64, "actions": np.int64}
-                episode |= {name: np.array(episode[name], dtype) for name, dtype in columns.items()}
-                episodes[number] = {**episode, "terminated": np.array(terminated), "truncated": np.array(truncated)}
-                spare.append(game)
-            else:
-                going_on.append((number, game, obs, episode))
-        playing = going_on
-    return [episodes[number] for number in range(len(seeds))]
+                running.remove(i)
+                episodes[i] |= {"terminated": np.array(terminated), "truncated": np.array(truncated)}
+    for episode, columns in zip(episodes, steps):
+        for name, column, dtype in zip(
+            ("actions", "rewards", "lives"), zip(*columns), (np.int64, np.float64, np.int64)
+        ):
+            episode[name] = np.array(column, dtype)
+    return episodes
 
 
 def check_video(args: Args) -> None:
     """Raise UsageError where the game cannot be drawn, before hours are spent on training."""
     try:
-        env = make_env(args.env_id, "rgb_array", **game_options(args))
+        env = make_atari(args.env_id, "rgb_array", **game_options(args))
         env.reset(seed=0)
         env.render()
     except Exception as error:  # a broken installation of ale-py
@@ -857,7 +858,7 @@ def check_video(args: Args) -> None:
 
 def record_video(policy, args: Args, run_dir: Path) -> None:
     """Play the first evaluation episode once more and write it into `videos/`."""
-    env = make_env(args.env_id, "rgb_array", **game_options(args))
+    env = make_atari(args.env_id, "rgb_array", **game_options(args))
     env = gym.wrappers.RecordVideo(env, str(run_dir / "videos"), lambda episode: True)
     obs, _ = env.reset(seed=episode_seed(args.seed, EVALUATION_STREAM, 0))
     ended = False
@@ -877,7 +878,7 @@ def evaluate(agent: AtariQNetwork, args: Args, run_dir: Path, device: torch.devi
     """Play `--eval-episodes` episodes that training never saw; write `evaluation.json` and, if asked, a video."""
     policy = evaluation_policy(agent, args, device)
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
-    episodes = play(policy, lambda: make_env(args.env_id, **game_options(args)), seeds)
+    episodes = play_atari(policy, lambda: make_atari(args.env_id, **game_options(args)), seeds)
     returns = [float(episode["rewards"].sum()) for episode in episodes]
     if args.capture_video:
         record_video(evaluation_policy(agent, args, device), args, run_dir)
@@ -893,7 +894,7 @@ def evaluate(agent: AtariQNetwork, args: Args, run_dir: Path, device: torch.devi
 
 
 def rewards_per_life(episode: dict[str, np.ndarray]) -> list[int]:
-    """How many rewards there were in each life of an episode: the score of Table 2.2, see the README."""
+    """How many rewards there were in each life of an episode: as Table 2.2 seems to count, see the README."""
     lost = np.flatnonzero(np.diff(episode["lives"]) < 0) + 2  # behind the step in which it was lost
     return [int((part > 0).sum()) for part in np.split(episode["rewards"], lost) if len(part)]
 
@@ -908,21 +909,21 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 def save_demonstrations(agent: AtariQNetwork, args: Args, run_dir: Path, device: torch.device) -> None:
     """Write `--save-demos` episodes into `demos/`."""
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
-    make_game = functools.partial(make_env, args.env_id, **game_options(args))
-    episodes = play(evaluation_policy(agent, args, device), make_game, seeds, keep=True)
+    make_game = functools.partial(make_atari, args.env_id, **game_options(args))
+    episodes = play_atari(evaluation_policy(agent, args, device), make_game, seeds)
     about = {"env_id": args.env_id, "player": args.exp_name, "mode": f"ε = {args.eval_epsilon}"}
     about["options"] = game_options(args)
-    write_demonstrations(run_dir / "demos", episodes, about)
+    write_atari_demonstrations(run_dir / "demos", episodes, about)
 
 
-def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
+def write_atari_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
     """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
 
     Each file has actions (T,), rewards (T,), lives (T,), terminated, truncated, seed, emulator_state, and t_ns (T,), the time of
     each action in nanoseconds of the game. Observations are not stored: emulator and actions give them again.
     """
     folder.mkdir(exist_ok=True)
-    step_ns = round(1e9 * about["options"]["frame_skip"] / FPS)
+    step_ns = round(1e9 * about["options"]["frame_skip"] / ATARI_FPS)
     manifest = {"version": 1, **about, "ale_py": ale_py.__version__, "files": {}}
     for i, episode in enumerate(episodes):
         content = io.BytesIO()
@@ -1023,7 +1024,7 @@ class Means:
 def main(args: Args) -> int:
     """Train, evaluate and write everything into the run's folder. Returns the exit code."""
     args = complete_args(args)
-    games = [make_env(args.env_id, **game_options(args)) for _ in range(args.num_envs)]
+    games = [make_atari(args.env_id, **game_options(args)) for _ in range(args.num_envs)]
     if args.capture_video:
         check_video(args)
     run_dir, checkpoint = open_run_dir(args)

@@ -28,17 +28,13 @@ DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's 
     "record_video": "continuous actions",
 }
 ATARI = {
-    "FPS": "the console's frames a second",
     "Learner": "of DQN",
     "Minibatch": "stacks of frames, one step",
     "Players": "games of ale-py",
     "ReplayBuffer": "each frame once",
     "check_video": "games of ale-py",
-    "make_env": "games of ale-py",
-    "play": "games of ale-py; keeps the emulator's state instead of frames",
     "record_video": "games of ale-py",
     "save_demonstrations": "games of ale-py, nearly greedy",
-    "write_demonstrations": "without the frames",
 }
 HWM_AGENTS = {
     "SIZES": "sizes of the HWM",

@@ -1,6 +1,7 @@
-"""dqn_gopher.py: the game beside Gymnasium's wrappers, the replay buffer beside a list, runs through the command line."""
+"""Gopher: the game beside Gymnasium's wrappers, the replay buffer beside a list, runs of the DQN and of its students."""
 
 import csv
+import functools
 import json
 import shutil
 import signal
@@ -14,10 +15,11 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from conftest import ROOT, assert_refused, command, kill_twice, run
+from conftest import ROOT, assert_refused, command, edit_manifest, kill_twice, rewrite, run
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
+from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_gopher as dqn
 
 SCRIPT = ROOT / "cleanrl_thesis" / "dqn_gopher.py"
@@ -44,7 +46,7 @@ def gymnasiums(env_id: str, obs_type: str) -> gym.Env:
 def test_frames_are_gymnasiums(env_id, obs_type, frames):
     """Over episodes with and without seeds, whose actions the emulator repeats by chance."""
     theirs = gymnasiums(env_id, obs_type)
-    ours = dqn.make_env(env_id, obs_type=obs_type, noop_max=30 if obs_type == "pixels" else 0)
+    ours = dqn.make_atari(env_id, obs_type=obs_type, noop_max=30 if obs_type == "pixels" else 0)
     rng, seeds = np.random.default_rng(0), iter([5, 6, None, None, None, None])
     assert ours.observation_space == theirs.observation_space and ours.action_space == theirs.action_space
     ended = True
@@ -61,11 +63,11 @@ def test_frames_are_gymnasiums(env_id, obs_type, frames):
 
 
 def test_gymnasium_finds_no_fault():
-    check_env(dqn.make_env("ALE/Gopher-v5"), skip_render_check=True)
+    check_env(dqn.make_atari("ALE/Gopher-v5"), skip_render_check=True)
 
 
 def test_an_episode_of_thirty_minutes_is_a_time_out():
-    game = dqn.make_env("ALE/Pong-v5", obs_type="ram", frame_skip=1, noop_max=0)
+    game = dqn.make_atari("ALE/Pong-v5", obs_type="ram", frame_skip=1, noop_max=0)
     game.emulator.setInt("max_num_frames_per_episode", 50)
     game.reset(seed=0)
     steps = [game.step(0) for _ in range(50)]
@@ -262,10 +264,10 @@ def test_demonstrations_can_be_played_again(small):
         with np.load(path, allow_pickle=False) as arrays:
             demo = dict(arrays)
         assert demo["t_ns"][15] == pytest.approx(1e9, abs=100)
-        game = dqn.make_env(manifest["env_id"], **manifest["options"])
+        game = dqn.make_atari(manifest["env_id"], **manifest["options"])
         game.reset(seed=int(demo["seed"]))
         seeded = [game.step(int(action)) for action in demo["actions"]]
-        game = dqn.make_env(manifest["env_id"], **manifest["options"])
+        game = dqn.make_atari(manifest["env_id"], **manifest["options"])
         game.reset(seed=0)
         state = ale_py.ALEState.__new__(ale_py.ALEState)
         state.__setstate__(demo["emulator_state"].tobytes())
@@ -283,7 +285,7 @@ def test_the_model_plays_as_it_was_evaluated(small):
     network.load_state_dict(safetensors.torch.load_file(small / "model.safetensors"))
     evaluation = json.loads((small / "evaluation.json").read_text())
     policy = dqn.epsilon_greedy_policy(dqn.greedy_policy(network, torch.device("cpu")), 8, 0.5, seed=1)
-    episodes = dqn.play(policy, lambda: dqn.make_env("ALE/Gopher-v5", obs_type="ram"), evaluation["seeds"])
+    episodes = dqn.play_atari(policy, lambda: dqn.make_atari("ALE/Gopher-v5", obs_type="ram"), evaluation["seeds"])
     assert [episode["rewards"].sum() for episode in episodes] == evaluation["returns"]
 
 
@@ -335,3 +337,117 @@ def test_it_learns_from_the_memory(tmp_path):
     flags = ["--obs-type", "ram", "--total-timesteps", 1_000_000, "--eval-episodes", 30, "--run-dir", "run"]
     run(*flags, cwd=tmp_path, script=SCRIPT)
     assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["mean"] > 750
+
+
+# The synthetic human, and students
+DISTILL = ROOT / "cleanrl_thesis" / "distill_hybrid.py"
+SMALL_DISTILL = [
+    *("--env-id", "ALE/Gopher-v5", "--demo-frames", 600, "--test-frames", 100, "--epochs", 4, "--hidden-size", 32),
+    *("--eval-episodes", 1, "--checkpoint-interval", 1),
+]
+
+
+@pytest.fixture(scope="session")
+def pixel_teacher(tmp_path_factory) -> Path:
+    """A DQN on pixels that has hardly begun to learn."""
+    folder = tmp_path_factory.mktemp("gopher")
+    flags = ["--total-timesteps", 1_600, "--learning-starts", 800, "--hidden-size", 32, "--noop-max", 30, "--bf16"]
+    flags += ["--eval-episodes", 1, "--eval-epsilon", 1, "--save-model", "--run-dir", "run"]
+    run(*flags, cwd=folder, script=SCRIPT)
+    return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def student(tmp_path_factory, pixel_teacher) -> Path:
+    """An undisturbed small run of the hybrid on Gopher."""
+    folder = tmp_path_factory.mktemp("distill")
+    flags = ["--teacher", pixel_teacher, "--run-dir", "run", "--save-model", "--save-demos", 1, "--bf16"]
+    run(*SMALL_DISTILL, *flags, cwd=folder, script=DISTILL)
+    return folder / "run"
+
+
+def memory_after(actions: list[int]) -> np.ndarray:
+    """The console's memory after some actions in an episode without idle frames at first."""
+    game = dqn.make_atari("ALE/Gopher-v5", obs_type="ram", frame_stack=1, noop_max=0)
+    game.reset(seed=3)
+    for action in actions:
+        obs, *_ = game.step(action)
+    return obs[0].astype(int)
+
+
+def test_the_memory_is_where_the_synthetic_human_looks():
+    """The farmer goes a pixel a frame; in a while the gopher digs holes, of which the farmer's shovel fills one."""
+    idle = 300 * [distill.NOOP]
+    there = memory_after(idle)
+    assert there[distill.SCENE] == distill.IN_PLAY
+    right = memory_after([*idle, *(10 * [distill.GO_RIGHT])])
+    assert 30 <= right[distill.FARMER_X] - there[distill.FARMER_X] <= 40  # an action is repeated by chance
+    garden = there[: distill.ROWS * distill.ROW_BYTES].reshape(distill.ROWS, distill.ROW_BYTES)
+    dug = (garden[:, distill.HOLE_BYTES] & distill.HOLE_BITS) > 0
+    assert dug.any() and not (dug[:-1] & ~dug[1:]).any()  # from the tunnel up
+    human = distill.SyntheticGopherHuman(1, 0)
+    _, place, _ = human.choose(there[distill.FARMER_X], there, there)
+    assert place - distill.SHOVEL in distill.HOLES[dug.any(0)]
+
+
+def test_the_synthetic_human_presses_and_lets_go():
+    make_game = functools.partial(distill.make_atari, "ALE/Gopher-v5", obs_type="ram", frame_stack=1)
+    first, again = (distill.play_atari(distill.SyntheticGopherHuman(1, 0), make_game, [7])[0] for _ in range(2))
+    assert np.array_equal(first["actions"], again["actions"])
+    presses = np.isin(first["actions"], (distill.FIRE, distill.RIGHT_FIRE, distill.LEFT_FIRE))
+    assert presses.any() and not (presses[1:] & presses[:-1]).any()
+    assert first["rewards"].sum() > 0
+
+
+def test_a_killed_student_of_gopher_ends_with_the_same_bytes(student, pixel_teacher, tmp_path):
+    flags = [*SMALL_DISTILL, "--teacher", pixel_teacher, "--bf16", "--run-dir", "run"]
+    run(*flags, "--stop-at", 2, cwd=tmp_path, script=DISTILL)
+    run(*flags, "--resume", cwd=tmp_path, script=DISTILL)
+    for name in ("updates.csv", "evaluation.json"):
+        assert (tmp_path / "run" / name).read_bytes() == (student / name).read_bytes()
+    evaluation = json.loads((student / "evaluation.json").read_text())
+    assert evaluation["sampled"]["rewards_per_life"]["episodes"] >= 3
+
+
+def test_recordings_of_gopher_are_played_again_and_learned_from(student, pixel_teacher, tmp_path):
+    """The synthetic human's folder given as a recording leads to the same student; its files hold no frames."""
+    demos = student / "demos_synthetic_human"
+    with np.load(next(demos.glob("*.npz")), allow_pickle=False) as arrays:
+        assert "observations" not in arrays and arrays["emulator_state"].dtype == np.uint8
+    flags = [*SMALL_DISTILL, "--teacher", pixel_teacher, "--bf16", "--demos", demos, "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=DISTILL)
+    assert (tmp_path / "run" / "updates.csv").read_bytes() == (student / "updates.csv").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "damage, words",
+    [
+        (lambda f: rewrite(f, lambda a: {**a, "actions": 7 - a["actions"]}), ["other rewards", "ale-py"]),
+        (lambda f: rewrite(f, lambda a: {**a, "emulator_state": a["emulator_state"][::-1]}), ["other rewards"]),
+        (lambda f: rewrite(f, lambda a: {**a, "seed": np.array([1, 2])}), ["one seed"]),
+        (lambda f: rewrite(f, lambda a: {k: v for k, v in a.items() if k != "seed"}), ["no demonstration"]),
+        (lambda f: edit_manifest(f, lambda m: m["options"].update(frame_skip=1)), ["frame_skip", "1"]),
+    ],
+    ids=["actions", "state", "seeds", "none", "skip"],
+)
+def test_a_wrong_recording_is_named(damage, words, student, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(student / "demos", "demos")
+    damage(Path("demos"))
+    flags = ["--env-id", "ALE/Gopher-v5", "--alpha", 0, "--demos", "demos", "--run-dir", "run"]
+    assert_refused(distill, capsys, flags, ["--demos demos", *words])
+    assert not Path("run").exists()
+
+
+def test_a_teacher_that_reads_the_memory_is_refused(small, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    flags = ["--env-id", "ALE/Gopher-v5", "--teacher", small, "--run-dir", "run"]
+    assert_refused(distill, capsys, flags, ["--teacher", "another shape"])
+    flags = ["--env-id", "ALE/Gopher-v5", "--teacher", tmp_path / "none", "--run-dir", "run"]
+    assert_refused(distill, capsys, flags, ["--teacher", "dqn_gopher.py --save-model"])
+
+
+def test_states_of_the_dqn_itself(pixel_teacher, tmp_path):
+    flags = [*SMALL_DISTILL, "--teacher", pixel_teacher, "--states", "own", "--epochs", 1, "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=DISTILL)
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["complete"]
