@@ -617,7 +617,7 @@ class SyntheticGopherHuman:
     """
 
     reaction = 4  # how late it sees, in actions of 4 frames: 267 ms
-    aim_error = 2.0  # deviation of the place where it wants to stand, in pixels, for each new aim
+    aim_error = 2.5  # deviation of the place where it wants to stand, in pixels, for each new aim
     close_enough = 3.0  # pixels from there
     taps = (2, 5)  # actions from one press of the button to the next, at least, and at most one less
     lapse, lapse_actions = 0.005, 8.0  # how often the mind is elsewhere, per action, and for how many on average
