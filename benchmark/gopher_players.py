@@ -91,8 +91,8 @@ def main(args: Args) -> None:
                 rows += measure(method, f"synthetic human, {name} {value}", other, args)[-1:]
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "players.csv", rows)
-    line = f"python benchmark/gopher_players.py{' --calibrate' if args.calibrate else ''} --seed {args.seed}"
-    (args.out / "players.md").write_text(f"`{line}`, commit {commit()}\n\n{table(rows)}")
+    line = f"python benchmark/gopher_players.py{' --calibrate' if args.calibrate else ''} --episodes {args.episodes}"
+    (args.out / "players.md").write_text(f"`{line} --seed {args.seed}`, commit {commit()}\n\n{table(rows)}")
     print(table(rows))
 
 
