@@ -4,11 +4,11 @@
     python benchmark/hwm_agreement.py     # runs/hwm_segment -> benchmark/results/hwm_segment/agreement.md and a figure
 
 One model reads once on its way into another room, but at which step around the door differs from seed to seed, for the bound
-(Eq. 3.3.5) hardly tells these steps apart. What does is how well p(m), which sees only the present state, foretells q(m), which sees
-the frames that follow: KL_m. So of ten models the five with the least KL_m make a committee. Boundaries that people see in a film
-are settled in the same way, by the steps at which many of them press the button: a model votes for the steps at which p(m)
-reads, each vote counts for the steps beside it too, but less, and a boundary is where the sum is greatest, if it is at least
-half of the number of models.
+(Eq. 3.3.5) hardly tells these steps apart. KL_m may: how well p(m), which sees only the present state, foretells q(m), which sees
+the frames that follow. So of ten models the five with the least KL_m make a committee; whether that helps is what the table
+says. Boundaries that people see in a film are settled in the same way, by the steps at which many of them press the button: a
+model votes for the steps at which p(m) reads, each vote counts for the steps beside it too, but less, and a boundary is where
+the sum is greatest, if it is at least half of the number of models.
 
 `KERNEL` and `SHARE` were chosen on seeds 1 to 8, the choice by KL_m on seeds 1 to 33; the committees of the table are of other
 seeds, and have none in common.

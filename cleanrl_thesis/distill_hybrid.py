@@ -101,7 +101,7 @@ class Args:
     compile: bool = False
     """run each update step as one compiled graph (needs a C++ compiler; compiling takes seconds, once)"""
     bf16: bool = False
-    """the student's and the DQN's convolutions in bfloat16: faster where the processor has instructions for it"""
+    """the student's first layers and Atari's DQN in bfloat16: faster where the processor has instructions for it"""
     track: bool = False
     """also log to Weights and Biases (`pip install wandb`)"""
     wandb_project_name: str = "cleanrl-thesis"
@@ -1478,12 +1478,11 @@ def save_demonstrations(student: Student, args: Args, run_dir: Path) -> None:
 
 
 def save_episodes(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
-    """Write demonstrations in the form of their environment: those of Atari without observations."""
+    """Write demonstrations; those of Atari without observations, which seeds and actions give again."""
     if is_atari(about["env_id"]):
-        without = [{name: column for name, column in each.items() if name != "observations"} for each in episodes]
-        write_atari_demonstrations(folder, without, {**about, "options": RECORDED})
-    else:
-        write_demonstrations(folder, episodes, about)
+        episodes = [{name: each[name] for name in each if name != "observations"} for each in episodes]
+        about = {**about, "options": RECORDED, "ale_py": ale_py.__version__}
+    write_demonstrations(folder, episodes, about)
 
 
 def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
@@ -1495,23 +1494,6 @@ def write_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], ab
     folder.mkdir(exist_ok=True)
     step_ns = round(1e9 / make_env(about["env_id"]).metadata.get("render_fps", 1))
     manifest = {"version": 1, **about, "files": {}}
-    for i, episode in enumerate(episodes):
-        content = io.BytesIO()
-        np.savez(content, **episode, t_ns=np.arange(len(episode["rewards"]), dtype=np.int64) * step_ns)
-        write_whole(folder / f"episode_{i:05d}.npz", content.getvalue())
-        manifest["files"][f"episode_{i:05d}.npz"] = hashlib.sha256(content.getvalue()).hexdigest()
-    write_json(folder / "manifest.json", manifest)
-
-
-def write_atari_demonstrations(folder: Path, episodes: list[dict[str, np.ndarray]], about: dict) -> None:
-    """Write episodes as `episode_*.npz`, and a manifest with `about` and their checksums (SHA-256).
-
-    Each file has actions (T,), rewards (T,), lives (T,), terminated, truncated, seed, emulator_state, and t_ns (T,), the time of
-    each action in nanoseconds of the game. Observations are not stored: emulator and actions give them again.
-    """
-    folder.mkdir(exist_ok=True)
-    step_ns = round(1e9 * about["options"]["frame_skip"] / ATARI_FPS)
-    manifest = {"version": 1, **about, "ale_py": ale_py.__version__, "files": {}}
     for i, episode in enumerate(episodes):
         content = io.BytesIO()
         np.savez(content, **episode, t_ns=np.arange(len(episode["rewards"]), dtype=np.int64) * step_ns)

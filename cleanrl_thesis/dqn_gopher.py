@@ -957,6 +957,7 @@ def plot_learning_curve(run_dir: Path, args: Args, evaluation: dict) -> None:
     axes.set_title(f"{args.env_id}, DQN on {args.obs_type}, seed {args.seed}")
     axes.set_xlabel("frames")
     axes.set_ylabel("episodic return")
+    axes.locator_params(axis="x", nbins=6)
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.legend(loc="best", fontsize="small")
     axes.spines[["top", "right"]].set_visible(False)

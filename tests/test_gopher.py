@@ -333,7 +333,7 @@ def test_runs_killed_at_random_end_with_the_same_bytes(small, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_it_learns_from_the_memory(tmp_path):
-    """Random play gets about 250 points."""
+    """Random play gets 335 points."""
     flags = ["--obs-type", "ram", "--total-timesteps", 1_000_000, "--eval-episodes", 30, "--run-dir", "run"]
     run(*flags, cwd=tmp_path, script=SCRIPT)
     assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["mean"] > 750
