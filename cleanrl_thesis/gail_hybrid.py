@@ -796,14 +796,15 @@ def draw_car(cars: Cars, car: int, side: int = 480) -> np.ndarray:
     for x, line in zip((0.04, 0.45, 0.8), text):
         pen.text((x * fine, 0.95 * fine), line, (255, 255, 255), font, "lm")
     outline = track.place(np.arange(0, track.length, 10), np.zeros(len(stripes)))[1]
-    low, size = outline.min(1), np.ptp(outline, axis=1).max()
-    corner = np.array([0.72 * fine, 0.26 * fine])
+    low, size = outline.min(1, keepdims=True), np.ptp(outline, axis=1).max()
+    corner = np.array([[0.72], [0.26]]) * fine
 
-    def on_map(xy: np.ndarray) -> tuple[float, float]:
-        return tuple((corner + (xy - low) / size * 0.24 * fine * np.array([1, -1])).tolist())
+    def on_map(xy: np.ndarray) -> list[tuple[float, float]]:
+        x, y = corner + (xy - low) / size * 0.24 * fine * np.array([[1], [-1]])
+        return list(zip(x.tolist(), y.tolist()))
 
-    pen.line([on_map(point) for point in outline.T] + [on_map(outline[:, 0])], (255, 255, 255), 6)
-    x, y = on_map(own)
+    pen.line(on_map(np.concatenate([outline, outline[:, :1]], 1)), (255, 255, 255), 6)
+    ((x, y),) = on_map(own[:, None])
     pen.ellipse((x - 10, y - 10, x + 10, y + 10), (196, 40, 44))
     return np.asarray(image.reduce(2))
 

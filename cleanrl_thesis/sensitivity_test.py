@@ -1,0 +1,840 @@
+"""The double-blind study of chapter 2: people see clips of play and say of each whether a human or a machine plays.
+
+    python cleanrl_thesis/sensitivity_test.py --videos study --prepare human=recordings/anna dqn=runs/apple_teacher
+    python cleanrl_thesis/sensitivity_test.py --videos study --db study.sqlite           # the study, in the browser
+    python cleanrl_thesis/sensitivity_test.py --db study.sqlite --export results         # the tables' last column
+
+`--prepare NAME=FOLDER ...` cuts clips into `--videos`/NAME/. A folder is one of recordings or of `--save-demos`, a run, whose
+own script is asked for episodes, or one of videos. All are drawn by the same renderer at the same speed, without metadata.
+
+| what | how | source |
+|---|---|---|
+| a participant | consents, reads the rules, then sees two clips of each agent, in an order of their own | sections 2.4.1 to 2.4.3 |
+| clips | 15 s, driving 30 s, from a random moment; episodes that end sooner have none | sections 2.4.1 to 2.4.3; ours |
+| double-blind | a clip's address is drawn at random for each participant; whose it is, is joined at `--export` alone | ours |
+| what is stored | age and gender if given, verdicts, comments; no name, address or time | ours |
+| an answer | is on disk when the page goes on; sent twice, it counts once and the first one stays | ours |
+| interval | 95%, bootstrap over participants, for each judges several clips; where all agree, the exact bound for a share that no one, or everyone, has | ours |
+"""
+
+# /// script
+# requires-python = ">=3.11"
+# dependencies = [
+#     "ale-py>=0.11",
+#     "fastapi>=0.115",
+#     "gymnasium>=1.2",
+#     "imageio-ffmpeg>=0.5",
+#     "matplotlib>=3.9",
+#     "numpy>=2.0",
+#     "opencv-python-headless>=4.10",
+#     "pillow>=10.1",
+#     "safetensors>=0.4",
+#     "tensorboard>=2.17",
+#     "torch>=2.7",
+#     "tqdm>=4.66",
+#     "tyro>=0.9",
+#     "uvicorn>=0.30",
+# ]
+# ///
+import contextlib
+import csv
+import hashlib
+import importlib.util
+import io
+import itertools
+import json
+import os
+import random
+import re
+import secrets
+import signal
+import socket
+import sqlite3
+import struct
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Literal
+
+import cv2
+import gymnasium as gym
+import numpy as np
+import tyro
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Arguments
+# ---------------------------------------------------------------------------------------------------------------------
+@dataclass
+class Args:
+    videos: Path | None = None
+    """the clips: a folder for each agent, with its *.mp4; `rules.txt` and `practice.mp4` beside them are shown first"""
+    db: Path = Path("study.sqlite")
+    """the study's answers, an SQLite database; the study goes on where it exists"""
+    prepare: tuple[str, ...] = ()
+    """NAME=FOLDER of each agent: cut clips into `--videos`, instead of asking people"""
+    practice: Path | None = None
+    """folder of the play that everyone is shown first, as for `--prepare`"""
+    export: Path | None = None
+    """write the table and the comments into this folder, instead of asking people"""
+    clips: int = 8
+    """clips to cut of each agent"""
+    seconds: float | None = None
+    """length of a clip; default: 15, driving 30 (sections 2.4.1 to 2.4.3)"""
+    seed: int = 1
+    """seed of the moments at which clips begin, and of the bootstrap"""
+    clips_per_agent: int = 2
+    """clips of each agent that a participant sees (sections 2.4.1 to 2.4.3)"""
+    consent: Path | None = None
+    """a text file to be agreed to, instead of the page's own text"""
+    contact: str = ""
+    """who answers a participant's questions, shown below the consent"""
+    host: str = "127.0.0.1"
+    """address to listen on; 0.0.0.0 lets every machine of the network in"""
+    port: int = 8000
+    """port to listen on; 0 takes a free one"""
+
+
+class UsageError(Exception):
+    """A user's mistake, told in one line; the exit code is 2."""
+
+
+def parse_args(argv: list[str] | None = None) -> Args:
+    """Read the command line. Raises UsageError with one line where tyro prints a box."""
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(Args, args=argv, description=__doc__.split("\n\n")[0])
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [line.strip("│ ") for line in complaint.getvalue().splitlines()]
+        message = " ".join(line for line in lines[1:] if line and line[0] not in "─╰").split("For full helptext")[0]
+        raise UsageError(message.split("Argument helptext")[0].strip()) from None
+
+
+def first_line(error: Exception) -> str:
+    return (str(error) or repr(error)).splitlines()[0]
+
+
+def require(holds: bool, flag: str, value: object, allowed: str) -> None:
+    """Raise UsageError for a flag, its value and what is allowed, unless `holds`."""
+    if not holds:
+        raise UsageError(f"{flag} {value}".strip() + f": {allowed}")
+
+
+def complete_args(args: Args) -> Args:
+    """Check all. Raises UsageError."""
+    require(not (args.prepare and args.export), "--prepare --export", "", "must be given alone")
+    needs = "is needed: the folder of the clips, a folder in it for each agent"
+    require(args.export is not None or args.videos is not None, "--videos", "", needs)
+    for flag, value in (("--clips", args.clips), ("--clips-per-agent", args.clips_per_agent)):
+        require(value >= 1, flag, value, "must be at least 1")
+    require(args.seconds is None or 0 < args.seconds < 3_600, "--seconds", args.seconds, "must be between 0 and 3600")
+    require(0 <= args.seed < 2**32, "--seed", args.seed, "must be between 0 and 4294967295")
+    require(0 <= args.port < 2**16, "--port", args.port, "must be between 0 and 65535")
+    names = [agent.partition("=")[0] for agent in args.prepare]
+    for agent, name in zip(args.prepare, names):
+        named = re.fullmatch(r"[\w.-]{1,40}=.+", agent) is not None and not name.startswith(".")
+        require(named, "--prepare", agent, "must be NAME=FOLDER, the name of letters, digits, -, _ and .")
+    require(len(set(names)) == len(names), "--prepare", " ".join(args.prepare), "names an agent twice")
+    require(args.practice is None or bool(args.prepare), "--practice", args.practice, "belongs to --prepare")
+    if args.consent is not None:
+        require(args.consent.is_file(), "--consent", args.consent, "is no file")
+    if args.prepare and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise UsageError("--prepare: needs imageio-ffmpeg: pip install imageio-ffmpeg")
+    if not args.prepare and args.export is None:
+        for name in ("fastapi", "uvicorn"):
+            allowed = "are needed for the page: pip install fastapi uvicorn"
+            require(importlib.util.find_spec(name) is not None, "fastapi and uvicorn", "", allowed)
+    return args
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Clips
+# ---------------------------------------------------------------------------------------------------------------------
+RULES = {
+    "AppleGame-v0": "The player is the blue disc. It takes a red apple by touching it: each one counts. An apple that nobody "
+    "takes is gone after a second and a half, and another one appears. A round lasts 30 seconds.",
+    "ALE/Gopher-v5": "The player is the farmer, who keeps the gopher from three carrots. The gopher digs holes up to the "
+    "garden; the farmer fills them with a shovel, and hits the gopher when it comes out.",
+    "TorcsLike-v0": "The player drives the red car as far as it can in 60 seconds, on the road and past the parked cars.",
+}
+ATARI_SCALE = 3  # pixels of a clip for each of the console's
+CLIP_TIME = 315_532_800  # of every file, 1980-01-01: a clip does not tell when it was made
+
+
+def load_method(name: str) -> ModuleType:
+    """The method file of that name beside this one, which holds the game."""
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[name])
+    return sys.modules[name]
+
+
+def write_whole(path: Path, content: bytes, keep_old_as: str | None = None) -> None:
+    """Replace a file so that a crash leaves the old content or the new, never a part."""
+    new = path.with_name(path.name + ".tmp")
+    with open(new, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    if keep_old_as is not None and path.exists():
+        os.replace(path, path.with_name(keep_old_as))
+    os.replace(new, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def write_json(path: Path, content: dict) -> None:
+    write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+@dataclass
+class Play:
+    """Recorded play that clips are cut from."""
+
+    env_id: str  # "" of videos
+    fps: float
+    lengths: dict[Path, int]  # frames of each episode or video
+    options: dict
+
+    def frames(self, path: Path, start: int, count: int) -> Iterator[np.ndarray]:
+        """`count` pictures from the frame `start` on, (H, W, 3) uint8."""
+        if path.suffix == ".mp4":
+            frames = read_video(path)
+        else:
+            frames = draw_episode(self.env_id, self.options, read_arrays(path))
+        yield from itertools.islice(frames, start, start + count)
+
+
+def read_video(path: Path) -> Iterator[np.ndarray]:
+    """The pictures of a video. Raises UsageError."""
+    import imageio_ffmpeg
+
+    try:
+        parts = imageio_ffmpeg.read_frames(str(path))
+        width, height = next(parts)["size"]
+        for part in parts:
+            yield np.frombuffer(part, np.uint8).reshape(height, width, 3)
+    except (OSError, RuntimeError, StopIteration) as error:
+        raise UsageError(f"--prepare {path}: no video: {first_line(error)}") from None
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """What is needed of an episode to play it again. Raises UsageError."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in ("seed", "actions", "rewards")}
+    except (KeyError, ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
+        raise UsageError(f"--prepare {path}: no demonstration: {first_line(error)}") from None
+
+
+def draw_episode(env_id: str, options: dict, episode: dict[str, np.ndarray]) -> Iterator[np.ndarray]:
+    """Play an episode again and draw what each frame shows, an agent's actions of 4 frames too. Raises UsageError."""
+    repeats = 1
+    if env_id.startswith("ALE/"):
+        noop_max, repeats = options.get("noop_max", 30), options.get("frame_skip", 4)
+        env = load_method("dqn_gopher").make_atari(env_id, frame_skip=1, frame_stack=1, noop_max=noop_max)
+    else:
+        load_method("ddpg_torcs_like" if env_id == "TorcsLike-v0" else "dqn_apple")
+        env = gym.make(env_id, disable_env_checker=True, **options).unwrapped
+    env.reset(seed=int(episode["seed"]))
+    for action, reward in zip(episode["actions"], episode["rewards"].tolist()):
+        for _ in range(repeats):
+            _, points, terminated, truncated, _ = env.step(action)
+            reward -= points
+            image = env.render()
+            if env_id.startswith("ALE/"):
+                image = image.repeat(ATARI_SCALE, 0).repeat(ATARI_SCALE, 1)
+            yield image
+            if terminated or truncated:
+                break
+        if reward != 0:
+            raise UsageError(f"--prepare: an episode of {env_id} gives other rewards when it is played again")
+
+
+def find_play(folder: Path, clips: int, seconds: float | None) -> Play:
+    """The play in a folder: demonstrations, a run's, made by its script where there are none, or videos. Raises UsageError."""
+    for place in (folder, folder / "demos"):
+        if (place / "manifest.json").exists():
+            return find_episodes(place)
+    if (folder / "args.json").exists():
+        ask_script(folder, clips)
+        return find_episodes(folder / "demos")
+    paths = sorted(folder.glob("*.mp4"))
+    require(bool(paths), "--prepare", folder, "holds no demonstrations, no run and no *.mp4")
+    import imageio_ffmpeg
+
+    rates, lengths = set(), {}
+    for path in paths:
+        try:
+            about = next(imageio_ffmpeg.read_frames(str(path)))
+        except (OSError, RuntimeError) as error:
+            raise UsageError(f"--prepare {path}: no video: {first_line(error)}") from None
+        rates.add(about["fps"])
+        lengths[path] = int(about["duration"] * about["fps"])
+    require(len(rates) == 1, "--prepare", folder, f"has videos of several frame rates, {sorted(rates)}")
+    return Play("", rates.pop(), lengths, {})
+
+
+def find_episodes(folder: Path) -> Play:
+    """The demonstrations in a folder. Raises UsageError."""
+    try:
+        manifest = json.loads((folder / "manifest.json").read_text())
+        files, env_id = dict(manifest["files"]), str(manifest["env_id"]).split(":")[-1]
+        options = dict(manifest.get("options") or {})
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UsageError(f"--prepare {folder}: its manifest.json cannot be read") from None
+    known = env_id in RULES or env_id.startswith("ALE/")
+    require(known, "--prepare", folder, f"was recorded in {env_id}, must be of {', '.join(RULES)} or ALE/*-v5")
+    lengths = {}
+    for name, checksum in sorted(files.items()):
+        path = folder / name
+        require(
+            Path(name).name == name and path.is_file(), "--prepare", folder, f"lacks {name}, which its manifest names"
+        )
+        same = hashlib.sha256(path.read_bytes()).hexdigest() == checksum
+        require(same, "--prepare", path, "its SHA-256 is not the manifest's, the file was changed or damaged")
+        repeats = options.get("frame_skip", 4) if env_id.startswith("ALE/") else 1
+        lengths[path] = len(read_arrays(path)["actions"]) * repeats
+    fps = {"TorcsLike-v0": 50}.get(env_id, 60)
+    return Play(env_id, fps, lengths, options)
+
+
+def ask_script(run_dir: Path, clips: int) -> None:
+    """Let a finished run's own script write episodes of its agent into `demos/`. Raises UsageError."""
+    try:
+        args = json.loads((run_dir / "args.json").read_text())
+        script = Path(__file__).with_name(f"{args['exp_name']}.py")
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UsageError(f"--prepare {run_dir}: its args.json cannot be read") from None
+    require(script.is_file(), "--prepare", run_dir, f"needs demos/: no script is called {script.name}")
+    require((run_dir / "result.json").exists(), "--prepare", run_dir, "needs demos/, and the run is not done")
+    flags = [f"--run-dir={run_dir}", "--resume", f"--save-demos={2 * clips}"]
+    help_text = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True).stdout
+    for name, value in args.items():
+        flag = f"--{name.replace('_', '-')}"
+        if name in ("run_dir", "resume", "save_demos") or value is None or flag not in help_text:
+            continue
+        flags += [flag if value else f"--no-{flag[2:]}"] if isinstance(value, bool) else [flag, str(value)]
+    print("asking", script.name, *flags)
+    done = subprocess.run(
+        [sys.executable, script, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    last = (done.stderr.strip().splitlines() or [""])[-1]
+    require(done.returncode == 0, "--prepare", run_dir, f"{script.name} could not play: {last}")
+
+
+def choose_windows(
+    lengths: dict[Path, int], frames: int, clips: int, rng: np.random.Generator
+) -> list[tuple[Path, int]]:
+    """Where clips of so many frames begin: in as many episodes as there are, without overlap in one."""
+    rounds: list[list[tuple[Path, int]]] = []
+    for path in rng.permutation(np.array(list(lengths), object)):
+        spare, count = lengths[path] % frames, lengths[path] // frames
+        first = int(rng.integers(spare + 1)) if count else 0
+        for i, window in enumerate(rng.permutation(count).tolist()):
+            rounds += [[]] if len(rounds) <= i else []
+            rounds[i].append((path, first + window * frames))
+    return [window for windows in rounds for window in windows][:clips]
+
+
+def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+    """Encode pictures as H.264 in MP4, of fixed settings and without metadata."""
+    import imageio_ffmpeg
+
+    first = next(frames)
+    height, width = first.shape[0] // 2 * 2, first.shape[1] // 2 * 2
+    clean = ["-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-movflags", "+faststart"]
+    options = {"codec": "libx264", "quality": None, "macro_block_size": 1, "ffmpeg_log_level": "error"}
+    new = path.with_name("new.tmp.mp4")
+    video = imageio_ffmpeg.write_frames(
+        str(new), (width, height), fps=fps, **options, output_params=["-crf", "20", "-threads", "1", *clean]
+    )
+    video.send(None)
+    for frame in itertools.chain([first], frames):
+        video.send(np.ascontiguousarray(frame[:height, :width]))
+    video.close()
+    os.utime(new, (CLIP_TIME, CLIP_TIME))
+    os.replace(new, path)
+
+
+def prepare(args: Args) -> int:
+    """Cut clips of each agent, all of the same game, size, speed and length. Returns the exit code."""
+    exists = args.videos.exists() and any(args.videos.iterdir())
+    require(not exists, "--videos", args.videos, "exists; clips are cut into a new folder")
+    sources = {name: Path(folder) for name, _, folder in (agent.partition("=") for agent in args.prepare)}
+    if args.practice is not None:
+        sources["practice"] = args.practice
+    plays = {name: find_play(folder, args.clips, args.seconds) for name, folder in sources.items()}
+    for what, values in (
+        ("games", {p.env_id for p in plays.values()}),
+        ("frame rates", {p.fps for p in plays.values()}),
+    ):
+        require(len(values) == 1, "--prepare", " ".join(args.prepare), f"are of different {what}: {sorted(values)}")
+    env_id, fps = next(iter(plays.values())).env_id, next(iter(plays.values())).fps
+    seconds = args.seconds or (30 if env_id == "TorcsLike-v0" else 15)
+    rng, cuts = np.random.default_rng(args.seed), {}
+    for name, play in plays.items():
+        count = 1 if name == "practice" else args.clips
+        cuts[name] = choose_windows(play.lengths, round(seconds * fps), count, rng)
+        allowed = f"has {len(cuts[name])} clips of {seconds:g} s, needs {count}: --clips or --seconds may be less"
+        require(len(cuts[name]) == count, "--prepare", f"{name}={sources[name]}", allowed)
+    args.videos.mkdir(parents=True, exist_ok=True)
+    made = []
+    for name, windows in cuts.items():
+        for i, (path, start) in enumerate(windows):
+            folder = args.videos / ("" if name == "practice" else name)
+            folder.mkdir(exist_ok=True)
+            clip = folder / ("practice.mp4" if name == "practice" else f"{i:03d}.mp4")
+            write_clip(clip, plays[name].frames(path, start, round(seconds * fps)), fps)
+            made.append({"clip": str(clip.relative_to(args.videos)), "from": path.name, "second": start / fps})
+        print(f"{name}: {len(windows)} clips of {seconds:g} s")
+    if env_id in RULES:
+        write_whole(args.videos / "rules.txt", (RULES[env_id] + "\n").encode())
+    write_json(args.videos / "prepared.json", {"env_id": env_id, "seed": args.seed, "clips": made})
+    find_clips(args.videos, args.clips_per_agent)
+    return 0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What a clip's file tells
+# ---------------------------------------------------------------------------------------------------------------------
+CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl"}
+METADATA = {b"udta", b"meta", b"uuid"}
+
+
+def boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Kinds and contents of the boxes of an MP4 file (ISO 14496-12), and of those within. Raises ValueError."""
+    at = 0
+    while at < len(content):
+        if at + 8 > len(content):
+            raise ValueError("a box is cut off")
+        size, kind, head = *struct.unpack_from(">I4s", content, at), 8
+        if size == 1 and at + 16 <= len(content):
+            size, head = struct.unpack_from(">Q", content, at + 8)[0], 16
+        size = size or len(content) - at
+        if size < head or at + size > len(content):
+            raise ValueError("a box is cut off")
+        inside = content[at + head : at + size]
+        yield kind, inside
+        if kind in CONTAINERS:
+            yield from boxes(inside)
+        at += size
+
+
+def describe_clip(content: bytes) -> tuple[float, int, int]:
+    """Seconds, width and height of an MP4 file. Raises ValueError where it is none, or holds metadata."""
+    found = dict(boxes(content))
+    if b"mvhd" not in found or b"tkhd" not in found:
+        raise ValueError("no MP4 video")
+    if METADATA & found.keys():
+        raise ValueError("holds metadata, which could tell the agent")
+    long = found[b"mvhd"][0] == 1
+    created, _, scale, duration = struct.unpack_from(">QQIQ" if long else ">IIII", found[b"mvhd"], 4)
+    if created:
+        raise ValueError("holds the time at which it was made, which could tell the agent")
+    width, height = struct.unpack_from(">II", found[b"tkhd"], len(found[b"tkhd"]) - 8)
+    return duration / scale, width >> 16, height >> 16
+
+
+@dataclass
+class Clip:
+    """One clip of an agent."""
+
+    agent: str
+    path: Path
+    sha256: str
+
+
+def find_clips(videos: Path, per_agent: int) -> list[Clip]:
+    """All clips of the agents' folders: alike in length and size, and without metadata. Raises UsageError."""
+    require(videos.is_dir(), "--videos", videos, "is no folder")
+    agents = sorted(path for path in videos.iterdir() if path.is_dir())
+    require(bool(agents), "--videos", videos, "has no folder of an agent")
+    clips, like = [], None
+    for folder in agents:
+        paths = sorted(folder.glob("*.mp4"))
+        require(len(paths) >= per_agent, "--videos", folder, f"has {len(paths)} *.mp4, each agent needs {per_agent}")
+        for path in paths:
+            is_inside = path.resolve().is_relative_to(videos.resolve()) and path.is_file() and not path.is_symlink()
+            require(is_inside, "--videos", path, "is a link, or no file")
+            content = path.read_bytes()
+            try:
+                seconds, width, height = describe_clip(content)
+            except (ValueError, struct.error) as error:
+                message = first_line(error)
+                raise UsageError(f"--videos {path}: {message}; --prepare makes clips that tell nothing") from None
+            like = like or (path, seconds, width, height)
+            same = abs(seconds - like[1]) < 0.05 and (width, height) == like[2:]
+            allowed = f"is {seconds:.2f} s of {width} x {height}, but {like[0].name} of {like[0].parent.name} is"
+            require(
+                same, "--videos", path, f"{allowed} {like[1]:.2f} s of {like[2]} x {like[3]}: it could tell the agent"
+            )
+            clips.append(Clip(folder.name, path, hashlib.sha256(content).hexdigest()))
+    return clips
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Answers
+# ---------------------------------------------------------------------------------------------------------------------
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS clips (clip INTEGER PRIMARY KEY, agent TEXT, file TEXT, sha256 TEXT UNIQUE);
+CREATE TABLE IF NOT EXISTS participants (participant INTEGER PRIMARY KEY, key TEXT UNIQUE, age INTEGER, gender TEXT);
+CREATE TABLE IF NOT EXISTS trials (
+    participant INTEGER REFERENCES participants, position INTEGER, clip INTEGER REFERENCES clips, address TEXT UNIQUE,
+    verdict TEXT CHECK (verdict IN ('human', 'machine')), why TEXT,
+    PRIMARY KEY (participant, position), UNIQUE (participant, clip)
+);
+"""
+
+
+@contextlib.contextmanager
+def transaction(path: Path) -> Iterator[sqlite3.Connection]:
+    """All of it is on disk at the end, or nothing."""
+    with contextlib.closing(sqlite3.connect(path, timeout=60, isolation_level=None)) as db:
+        db.execute("PRAGMA synchronous = FULL")
+        db.execute("BEGIN IMMEDIATE")
+        try:
+            yield db
+        except BaseException:
+            db.execute("ROLLBACK")
+            raise
+        db.execute("COMMIT")
+
+
+def open_database(path: Path, clips: list[Clip]) -> None:
+    """Create the tables, or go on with those that are there. Raises UsageError."""
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as db:
+            db.execute("PRAGMA journal_mode = WAL")
+            db.executescript(SCHEMA)
+        with transaction(path) as db:
+            known = {sha256: agent for sha256, agent in db.execute("SELECT sha256, agent FROM clips")}
+            there = {clip.sha256: clip.agent for clip in clips}
+            require(known.items() <= there.items(), "--videos", "", f"lacks clips, or has changed ones, of {path}")
+            require(len(there) == len(clips), "--videos", "", "has the same clip twice")
+            rows = [(clip.agent, clip.path.name, clip.sha256) for clip in clips if clip.sha256 not in known]
+            random.SystemRandom().shuffle(rows)  # so that a clip's number tells nothing
+            db.executemany("INSERT INTO clips (agent, file, sha256) VALUES (?, ?, ?)", rows)
+    except sqlite3.Error as error:
+        raise UsageError(f"--db {path}: {first_line(error)}") from None
+
+
+def join(path: Path, key: str, age: int | None, gender: str | None, per_agent: int) -> None:
+    """Note a participant, and draw clips in a random order: of each agent those that were seen least. Twice is once."""
+    with transaction(path) as db:
+        if db.execute("SELECT 1 FROM participants WHERE key = ?", (key,)).fetchone():
+            return
+        cursor = db.execute("INSERT INTO participants (key, age, gender) VALUES (?, ?, ?)", (key, age, gender))
+        seen = db.execute(
+            "SELECT agent, clips.clip, COUNT(position) FROM clips LEFT JOIN trials USING (clip) GROUP BY clips.clip"
+        ).fetchall()
+        rng, agents = random.SystemRandom(), {}
+        rng.shuffle(seen)
+        for agent, clip, _ in sorted(seen, key=lambda row: row[2]):
+            agents.setdefault(agent, []).append(clip)
+        drawn = [clip for clips in agents.values() for clip in clips[:per_agent]]
+        rng.shuffle(drawn)
+        rows = [(cursor.lastrowid, i, clip, secrets.token_urlsafe(16)) for i, clip in enumerate(drawn)]
+        db.executemany("INSERT INTO trials (participant, position, clip, address) VALUES (?, ?, ?, ?)", rows)
+
+
+def next_trial(path: Path, key: str) -> dict | None:
+    """What a participant sees next: position, total and the clip's address, or that all is done; None for a stranger."""
+    with contextlib.closing(sqlite3.connect(path, timeout=60)) as db:
+        rows = db.execute(
+            "SELECT position, address, verdict FROM trials JOIN participants USING (participant) WHERE key = ? ORDER BY position",
+            (key,),
+        ).fetchall()
+    if not rows:
+        return None
+    left = [(position, address) for position, address, verdict in rows if verdict is None]
+    if not left:
+        return {"done": True, "total": len(rows)}
+    return {"done": False, "position": left[0][0], "total": len(rows), "address": left[0][1]}
+
+
+def note_answer(path: Path, key: str, address: str, verdict: str, why: str) -> bool:
+    """Keep an answer to the clip that the participant is at; one that is answered already stays. False: not theirs yet."""
+    with transaction(path) as db:
+        row = db.execute(
+            "SELECT participant, position, verdict FROM trials JOIN participants USING (participant) WHERE key = ? AND address = ?",
+            (key, address),
+        ).fetchone()
+        if row is None:
+            return False
+        participant, position, before = row
+        if before is not None:
+            return True
+        open_before = "SELECT 1 FROM trials WHERE participant = ? AND position < ? AND verdict IS NULL"
+        if db.execute(open_before, (participant, position)).fetchone():
+            return False
+        change = "UPDATE trials SET verdict = ?, why = ? WHERE participant = ? AND position = ?"
+        db.execute(change, (verdict, why, participant, position))
+        return True
+
+
+def clip_file(path: Path, address: str) -> str | None:
+    """SHA-256 of the clip at an address."""
+    with contextlib.closing(sqlite3.connect(path, timeout=60)) as db:
+        row = db.execute("SELECT sha256 FROM trials JOIN clips USING (clip) WHERE address = ?", (address,)).fetchone()
+    return None if row is None else row[0]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Export
+# ---------------------------------------------------------------------------------------------------------------------
+RESAMPLES, LEVEL = 10_000, 0.95
+
+
+def interval(human: np.ndarray, judged: np.ndarray, seed: int) -> tuple[float, float]:
+    """Interval of the share `human.sum() / judged.sum()`, counts of each participant (P,).
+
+    By bootstrap over participants. Where no one, or everyone, says human, resamples are all alike: then the exact
+    (Clopper-Pearson) bound of P participants of whom none does.
+    """
+    tail, people = (1 - LEVEL) / 2, len(judged)
+    if human.sum() in (0, judged.sum()):
+        bound = 1 - tail ** (1 / people)
+        return (0.0, bound) if human.sum() == 0 else (1 - bound, 1.0)
+    draws = np.random.default_rng(seed).integers(people, size=(RESAMPLES, people))
+    shares = human[draws].sum(1) / judged[draws].sum(1)
+    low, high = np.quantile(shares, (tail, 1 - tail))
+    return float(low), float(high)
+
+
+def guarded(text: object) -> str:
+    """Text of a cell that no spreadsheet takes for a formula."""
+    text = "" if text is None else str(text)
+    return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") or text[:1] in ("\t", "\r", "\n") else text
+
+
+def write_csv(path: Path, rows: list[dict]) -> None:
+    """Write rows with the names of their columns."""
+    content = io.StringIO()
+    writer = csv.DictWriter(content, rows[0].keys(), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_whole(path, content.getvalue().encode())
+
+
+def count_verdicts(answers: list[tuple], seed: int) -> list[dict]:
+    """For each agent the column "Identified as Human", from answers (participant, agent, verdict, ...)."""
+    rows = []
+    for agent in sorted({answer[1] for answer in answers}):
+        people = sorted({who for who, name, *_ in answers if name == agent})
+        judged = np.array([sum(who == p and name == agent for who, name, *_ in answers) for p in people])
+        human = np.array(
+            [sum(who == p and name == agent and what == "human" for who, name, what, *_ in answers) for p in people]
+        )
+        low, high = interval(human, judged, seed)
+        row = {"agent": guarded(agent), "identified_as_human": int(human.sum()), "judged": int(judged.sum())}
+        row |= {"share": round(float(human.sum() / judged.sum()), 4), "low": round(low, 4), "high": round(high, 4)}
+        rows.append({**row, "participants": len(people)})
+    return rows
+
+
+def export(args: Args) -> int:
+    """Join answers and agents: print the table, write it and the comments. Returns the exit code."""
+    require(args.db.is_file(), "--db", args.db, "is no file")
+    query = (
+        "SELECT participant, agent, verdict, position, file, why, age, gender FROM trials JOIN clips USING (clip) "
+        "JOIN participants USING (participant) WHERE verdict IS NOT NULL ORDER BY participant, position"
+    )
+    try:
+        with contextlib.closing(sqlite3.connect(f"{args.db.resolve().as_uri()}?mode=ro", uri=True)) as db:
+            answers = db.execute(query).fetchall()
+    except sqlite3.Error as error:
+        raise UsageError(f"--db {args.db}: {first_line(error)}") from None
+    require(bool(answers), "--db", args.db, "holds no answers yet")
+    rows = count_verdicts(answers, args.seed)
+    names = ("participant", "agent", "verdict", "position", "clip", "comment", "age", "gender")
+    args.export.mkdir(parents=True, exist_ok=True)
+    write_csv(args.export / "identified_as_human.csv", rows)
+    comments = [{name: guarded(value) for name, value in zip(names, answer)} for answer in answers]
+    write_csv(args.export / "comments.csv", comments)
+    print(f"{'agent':<24}identified as human      share and 95% interval   participants")
+    for row in rows:
+        share = f"{row['share']:.0%}  [{row['low']:.0%}, {row['high']:.0%}]"
+        counts = f"{row['identified_as_human']} of {row['judged']}"
+        print(f"{row['agent']:<24}{counts:>19}{share:>28}{row['participants']:>15}")
+    return 0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The page
+# ---------------------------------------------------------------------------------------------------------------------
+MAX_BODY, MAX_COMMENT = 16_384, 2_000  # bytes of a request, characters of a comment
+GENDERS = Literal["female", "male", "another"]
+
+
+def allowed_hosts(host: str) -> set[str] | None:
+    """Names by which browsers may call this server, against rebinding of foreign names; None: all."""
+    return None if host in ("0.0.0.0", "::") else {"127.0.0.1", "localhost", "[::1]", host}
+
+
+def video_response(content: bytes, asked: str | None):
+    """A video, or the part of it that a Range header asks for; headers are the same for every clip of that size."""
+    from fastapi import Response
+
+    headers = {"Accept-Ranges": "bytes", "Cache-Control": "no-store"}
+    match = re.fullmatch(r"bytes=(\d{1,12})-(\d{0,12})", asked or "")
+    if match is None:
+        return Response(content, media_type="video/mp4", headers=headers)
+    first, last = int(match[1]), min(int(match[2] or len(content)), len(content) - 1)
+    if first > last:
+        return Response(status_code=416, headers={"Content-Range": f"bytes */{len(content)}"})
+    headers["Content-Range"] = f"bytes {first}-{last}/{len(content)}"
+    return Response(content[first : last + 1], 206, media_type="video/mp4", headers=headers)
+
+
+def make_app(args: Args, clips: list[Clip]):
+    """The web application: a page, three requests of it, and the clips."""
+    from fastapi import FastAPI, HTTPException, Request, Response
+    from pydantic import BaseModel, Field
+
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+    page, hosts = Path(__file__).with_suffix(".html").read_text(), allowed_hosts(args.host)
+    paths = {clip.sha256: clip.path for clip in clips}
+    rules, practice = args.videos / "rules.txt", args.videos / "practice.mp4"
+    about = {
+        "consent": None if args.consent is None else args.consent.read_text(),
+        "contact": args.contact,
+        "rules": rules.read_text() if rules.is_file() else "",
+        "practice": practice.is_file(),
+        "clips": len({clip.agent for clip in clips}) * args.clips_per_agent,
+        "seconds": round(describe_clip(clips[0].path.read_bytes())[0]),
+    }
+
+    class Key(BaseModel):
+        key: str = Field(pattern="^[0-9a-f]{32}$")
+
+    class Person(Key):
+        age: int | None = Field(default=None, ge=1, le=120)
+        gender: GENDERS | None = None
+
+    class Answer(Key):
+        address: str = Field(max_length=64)
+        verdict: Literal["human", "machine"]
+        why: str = Field(default="", max_length=MAX_COMMENT)
+
+    @app.middleware("http")
+    async def guard(request: Request, call_next) -> Response:
+        name = re.sub(r":\d+$", "", request.headers.get("host", ""))
+        if hosts is not None and name not in hosts:
+            return Response("unknown host", 421)
+        length = request.headers.get("content-length", "0" if request.method in ("GET", "HEAD") else "")
+        if "transfer-encoding" in request.headers or not length.isdecimal():
+            return Response("needs Content-Length", 411)
+        if int(length) > MAX_BODY:
+            return Response("too large", 413)
+        response = await call_next(request)
+        response.headers["X-Content-Type-Options"] = "nosniff"
+        response.headers["Referrer-Policy"] = "no-referrer"
+        return response
+
+    @app.get("/")
+    def show_page() -> Response:
+        nonce = secrets.token_urlsafe(16)
+        policy = "default-src 'none'; connect-src 'self'; media-src 'self'; form-action 'none'; "
+        policy += f"script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'"
+        content = page.replace("{{nonce}}", nonce).replace("{{about}}", json.dumps(about).replace("<", "\\u003c"))
+        headers = {"Content-Security-Policy": policy, "Cache-Control": "no-store"}
+        return Response(content, media_type="text/html", headers=headers)
+
+    def trial_of(key: str) -> dict:
+        trial = next_trial(args.db, key)
+        if trial is None:
+            raise HTTPException(404, "unknown participant")
+        return trial
+
+    @app.post("/join")
+    def take_part(person: Person) -> dict:
+        join(args.db, person.key, person.age, person.gender, args.clips_per_agent)
+        return trial_of(person.key)
+
+    @app.post("/next")
+    def go_on(person: Key) -> dict:
+        return trial_of(person.key)
+
+    @app.post("/answer")
+    def answer(given: Answer) -> dict:
+        if not note_answer(args.db, given.key, given.address, given.verdict, given.why):
+            raise HTTPException(409, "not the clip that is shown")
+        return trial_of(given.key)
+
+    @app.get("/practice.mp4")
+    def show_practice(request: Request) -> Response:
+        if not about["practice"]:
+            raise HTTPException(404)
+        return video_response(practice.read_bytes(), request.headers.get("range"))
+
+    @app.get("/clip/{address}")
+    def show_clip(address: str, request: Request) -> Response:
+        sha256 = clip_file(args.db, address)
+        if sha256 not in paths:
+            raise HTTPException(404)
+        return video_response(paths[sha256].read_bytes(), request.headers.get("range"))
+
+    return app
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket on that address. Raises UsageError."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        raise UsageError(f"--host {host} --port {port}: cannot be listened on: {error.strerror}") from None
+    return listener
+
+
+def serve(app, listener: socket.socket, host: str) -> None:
+    """Answer browsers until Ctrl-C or SIGTERM."""
+    import uvicorn
+
+    print(f"open http://{host}:{listener.getsockname()[1]} in a browser; Ctrl-C ends", flush=True)
+    settings = {"log_level": "warning", "access_log": False, "server_header": False, "date_header": False}
+    settings |= {"ws_max_size": MAX_BODY, "ws_per_message_deflate": False, "timeout_graceful_shutdown": 1}
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with contextlib.suppress(KeyboardInterrupt):
+        uvicorn.Server(uvicorn.Config(app, **settings)).run(sockets=[listener])
+
+
+def main(args: Args) -> int:
+    """Cut clips, ask people, or count what they said. Returns the exit code."""
+    args = complete_args(args)
+    if args.prepare:
+        return prepare(args)
+    if args.export is not None:
+        return export(args)
+    clips = find_clips(args.videos, args.clips_per_agent)
+    open_database(args.db, clips)
+    serve(make_app(args, clips), listen(args.host, args.port), args.host)
+    return 0
+
+
+def cli(argv: list[str] | None = None) -> int:
+    """Run from the command line: a user's mistake is one line and exit code 2."""
+    try:
+        return main(parse_args(argv))
+    except UsageError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(cli())
