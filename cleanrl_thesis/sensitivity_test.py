@@ -47,6 +47,7 @@ import os
 import random
 import re
 import secrets
+import shutil
 import signal
 import socket
 import sqlite3
@@ -60,7 +61,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
-import cv2
 import gymnasium as gym
 import numpy as np
 import tyro
@@ -262,7 +262,7 @@ def draw_episode(env_id: str, options: dict, episode: dict[str, np.ndarray]) -> 
             raise UsageError(f"--prepare: an episode of {env_id} gives other rewards when it is played again")
 
 
-def find_play(folder: Path, clips: int, seconds: float | None) -> Play:
+def find_play(folder: Path, clips: int) -> Play:
     """The play in a folder: demonstrations, a run's, made by its script where there are none, or videos. Raises UsageError."""
     for place in (folder, folder / "demos"):
         if (place / "manifest.json").exists():
@@ -364,8 +364,9 @@ def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     for frame in itertools.chain([first], frames):
         video.send(np.ascontiguousarray(frame[:height, :width]))
     video.close()
-    os.utime(new, (CLIP_TIME, CLIP_TIME))
-    os.replace(new, path)
+    write_whole(path, without_metadata(new.read_bytes()))
+    new.unlink()
+    os.utime(path, (CLIP_TIME, CLIP_TIME))
 
 
 def prepare(args: Args) -> int:
@@ -375,7 +376,7 @@ def prepare(args: Args) -> int:
     sources = {name: Path(folder) for name, _, folder in (agent.partition("=") for agent in args.prepare)}
     if args.practice is not None:
         sources["practice"] = args.practice
-    plays = {name: find_play(folder, args.clips, args.seconds) for name, folder in sources.items()}
+    plays = {name: find_play(folder, args.clips) for name, folder in sources.items()}
     for what, values in (
         ("games", {p.env_id for p in plays.values()}),
         ("frame rates", {p.fps for p in plays.values()}),
@@ -389,20 +390,22 @@ def prepare(args: Args) -> int:
         cuts[name] = choose_windows(play.lengths, round(seconds * fps), count, rng)
         allowed = f"has {len(cuts[name])} clips of {seconds:g} s, needs {count}: --clips or --seconds may be less"
         require(len(cuts[name]) == count, "--prepare", f"{name}={sources[name]}", allowed)
-    args.videos.mkdir(parents=True, exist_ok=True)
-    made = []
+    new, made = args.videos.with_name(args.videos.name + ".tmp"), []
+    shutil.rmtree(new, ignore_errors=True)
     for name, windows in cuts.items():
         for i, (path, start) in enumerate(windows):
-            folder = args.videos / ("" if name == "practice" else name)
-            folder.mkdir(exist_ok=True)
-            clip = folder / ("practice.mp4" if name == "practice" else f"{i:03d}.mp4")
+            clip = new / ("practice.mp4" if name == "practice" else f"{name}/{i:03d}.mp4")
+            clip.parent.mkdir(parents=True, exist_ok=True)
             write_clip(clip, plays[name].frames(path, start, round(seconds * fps)), fps)
-            made.append({"clip": str(clip.relative_to(args.videos)), "from": path.name, "second": start / fps})
-        print(f"{name}: {len(windows)} clips of {seconds:g} s")
+            made.append({"clip": str(clip.relative_to(new)), "from": path.name, "second": round(start / fps, 2)})
+        print(f"{name}: {len(windows)} clip{'s' * (len(windows) > 1)} of {seconds:g} s")
     if env_id in RULES:
-        write_whole(args.videos / "rules.txt", (RULES[env_id] + "\n").encode())
-    write_json(args.videos / "prepared.json", {"env_id": env_id, "seed": args.seed, "clips": made})
-    find_clips(args.videos, args.clips_per_agent)
+        write_whole(new / "rules.txt", (RULES[env_id] + "\n").encode())
+    write_json(new / "prepared.json", {"env_id": env_id, "seed": args.seed, "clips": made})
+    find_clips(new, 1)
+    if args.videos.exists():
+        args.videos.rmdir()
+    os.replace(new, args.videos)
     return 0
 
 
@@ -413,34 +416,43 @@ CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl"}
 METADATA = {b"udta", b"meta", b"uuid"}
 
 
-def boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Kinds and contents of the boxes of an MP4 file (ISO 14496-12), and of those within. Raises ValueError."""
-    at = 0
-    while at < len(content):
-        if at + 8 > len(content):
-            raise ValueError("a box is cut off")
-        size, kind, head = *struct.unpack_from(">I4s", content, at), 8
-        if size == 1 and at + 16 <= len(content):
-            size, head = struct.unpack_from(">Q", content, at + 8)[0], 16
-        size = size or len(content) - at
-        if size < head or at + size > len(content):
-            raise ValueError("a box is cut off")
-        inside = content[at + head : at + size]
-        yield kind, inside
+def boxes(content: bytes, at: int = 0, end: int | None = None) -> Iterator[tuple[bytes, int, int]]:
+    """The boxes of an MP4 file (ISO 14496-12), and those within: kind, and where its inside begins and ends.
+
+    Raises ValueError where one is cut off.
+    """
+    end = len(content) if end is None else end
+    while at < end:
+        if at + 16 > end and at + 8 != end:
+            raise ValueError("no MP4 video, or cut off")
+        size, kind = struct.unpack_from(">I4s", content, at)
+        head = 16 if size == 1 else 8
+        size = struct.unpack_from(">Q", content, at + 8)[0] if size == 1 else size or end - at
+        if size < head or at + size > end:
+            raise ValueError("no MP4 video, or cut off")
+        yield kind, at + head, at + size
         if kind in CONTAINERS:
-            yield from boxes(inside)
+            yield from boxes(content, at + head, at + size)
         at += size
+
+
+def without_metadata(content: bytes) -> bytes:
+    """An MP4 file whose boxes of metadata are free space."""
+    clean = bytearray(content)
+    for kind, start, end in boxes(content):
+        if kind in METADATA:
+            clean[start - 4 : end] = b"free" + bytes(end - start)
+    return bytes(clean)
 
 
 def describe_clip(content: bytes) -> tuple[float, int, int]:
     """Seconds, width and height of an MP4 file. Raises ValueError where it is none, or holds metadata."""
-    found = dict(boxes(content))
-    if b"mvhd" not in found or b"tkhd" not in found:
-        raise ValueError("no MP4 video")
+    found = {kind: content[start:end] for kind, start, end in boxes(content)}
+    if not {b"mvhd", b"tkhd"} <= found.keys():
+        raise ValueError("no MP4 video, or cut off")
     if METADATA & found.keys():
         raise ValueError("holds metadata, which could tell the agent")
-    long = found[b"mvhd"][0] == 1
-    created, _, scale, duration = struct.unpack_from(">QQIQ" if long else ">IIII", found[b"mvhd"], 4)
+    created, _, scale, duration = struct.unpack_from(">QQIQ" if found[b"mvhd"][0] else ">IIII", found[b"mvhd"], 4)
     if created:
         raise ValueError("holds the time at which it was made, which could tell the agent")
     width, height = struct.unpack_from(">II", found[b"tkhd"], len(found[b"tkhd"]) - 8)
@@ -674,7 +686,8 @@ def export(args: Args) -> int:
 # ---------------------------------------------------------------------------------------------------------------------
 # The page
 # ---------------------------------------------------------------------------------------------------------------------
-MAX_BODY, MAX_COMMENT = 16_384, 2_000  # bytes of a request, characters of a comment
+MAX_BODY = 16_384  # bytes that a browser may send at once
+MAX_COMMENT = 2_000  # characters
 GENDERS = Literal["female", "male", "another"]
 
 
