@@ -30,7 +30,7 @@ lint: $(VENV)/ready-test
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check .
 
 lock:
-	uv pip compile pyproject.toml --group test --group track --group bench --python-version 3.11 \
+	uv pip compile pyproject.toml --group test --group track --group bench --group study --group minari --python-version 3.11 \
 	    --no-emit-index-url --no-annotate --quiet --output-file requirements.lock
 
 clean:

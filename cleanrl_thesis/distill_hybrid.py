@@ -23,6 +23,7 @@ again after every crash: on the same machine the run ends with the same bytes.
 | split | by frame: neighbours of a test frame are trained on; `--split episode` keeps whole episodes apart | section 2.4.1; ours |
 
 Demonstrations of Atari hold seeds and actions; their frames, 28 kB each as stacks of four, are made again in memory (1.6 GB).
+People play frame by frame (`record_human.py`): each of their frames is one to learn from, seen as an agent would see it there.
 The number of rewards in each life, the unit in which Table 2.2 seems to count (see the README), is in `evaluation.json` beside
 the points.
 """
@@ -716,7 +717,7 @@ def join_frames(episodes: list[dict[str, np.ndarray]], frames: int) -> Frames:
     return Frames(obs, actions[:frames].astype(np.int64), np.concatenate(numbers)[:frames])
 
 
-def read_episode(path: Path, checksum: str, env: gym.Env) -> dict[str, np.ndarray]:
+def read_episode(path: Path, checksum: str, env: gym.Env, frame_skip: int = ATARI_SKIP) -> dict[str, np.ndarray]:
     """One demonstration. Raises UsageError where it is not what the manifest says, or is none of this environment."""
     try:
         content = path.read_bytes()
@@ -740,7 +741,7 @@ def read_episode(path: Path, checksum: str, env: gym.Env) -> dict[str, np.ndarra
     require(bool(scored), "--demos", path, "rewards must be finite numbers (T,)")
     if atari:
         require(actions.ndim == 1 and episode["seed"].shape == (), "--demos", path, "needs actions (T,) and one seed")
-        episode["observations"] = watch(env, episode)
+        episode["observations"] = watch(env, episode) if frame_skip == ATARI_SKIP else watch_frames(env, episode)
         allowed = "gives other rewards when it is played again: of another version of ale-py?"
         require(episode["observations"] is not None, "--demos", path, allowed)
     return episode
@@ -770,8 +771,28 @@ def watch(game: AtariGame, episode: dict[str, np.ndarray]) -> np.ndarray | None:
     return np.stack(observations) if same else None
 
 
-def read_demonstrations(folder: Path, env_id: str) -> list[dict[str, np.ndarray]]:
-    """All episodes of a folder, in the order of their names. Raises UsageError."""
+def watch_frames(game: AtariGame, episode: dict[str, np.ndarray]) -> np.ndarray | None:
+    """The same where each frame has an action, as people play: (T + 1, S, 84, 84), stacks as an agent would see them.
+
+    An agent that acts at this frame, and has acted for 4 frames each time before, sees this one and those 4, 8 and 12 ago.
+    """
+    first = game.reset(seed=int(episode["seed"]))[0][-1]
+    state = game.emulator.cloneState(include_rng=True).__getstate__()
+    same = state == episode["emulator_state"].tobytes()
+    ages = np.arange(len(game.stack) - 1, -1, -1) * game.frame_skip
+    screen, frames = game.screens[0].copy(), [first] * (ages[0] + 1)
+    for action, reward in zip(episode["actions"].tolist(), episode["rewards"].tolist()):
+        same = same and game.emulator.act(game.moves[action]) == reward
+        game.screens[1] = screen
+        game.look(0)
+        screen = game.screens[0].copy()
+        frames.append(game.frame())
+    steps = np.arange(ages[0], len(frames))
+    return np.stack(frames)[steps[:, None] - ages] if same else None
+
+
+def read_demonstrations(folder: Path, env_id: str, frames: int) -> list[dict[str, np.ndarray]]:
+    """Episodes of a folder in the order of their names, until there are so many frames. Raises UsageError."""
     try:
         manifest = json.loads((folder / "manifest.json").read_text())
         files, recorded, version = dict(manifest["files"]), str(manifest["env_id"]), manifest["version"]
@@ -781,12 +802,17 @@ def read_demonstrations(folder: Path, env_id: str) -> list[dict[str, np.ndarray]
     require(bool(files), "--demos", folder, "holds no demonstrations, its manifest names no file")
     same_game = recorded.split(":")[-1] == env_id.split(":")[-1]
     require(same_game, "--demos", folder, f"was recorded in {recorded}, --env-id is {env_id}")
-    env = make_env(env_id)
+    env, frame_skip = make_env(env_id), ATARI_SKIP
     if is_atari(env_id):
-        options = manifest.get("options") or {}
-        same = all(options.get(name) == value for name, value in RECORDED.items())
-        require(same, "--demos", folder, f"was recorded with {options}, needs {RECORDED}")
-    return [read_episode(folder / name, checksum, env) for name, checksum in sorted(files.items())]
+        options = dict(manifest.get("options") or {})
+        frame_skip = options.get("frame_skip")
+        same = frame_skip in (1, ATARI_SKIP) and options.get("noop_max") == RECORDED["noop_max"]
+        require(same, "--demos", folder, f"was recorded with {options}, needs {RECORDED} or a frame_skip of 1")
+    episodes: list[dict[str, np.ndarray]] = []
+    for name, checksum in sorted(files.items()):
+        if sum(len(episode["actions"]) for episode in episodes) < frames:
+            episodes.append(read_episode(folder / name, checksum, env, frame_skip))
+    return episodes
 
 
 def make_human_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
@@ -1562,7 +1588,10 @@ def start_wandb(args: Args, run_dir: Path) -> None:
 
 def read_human(args: Args) -> list[dict[str, np.ndarray]]:
     """The human's episodes. Raises UsageError."""
-    episodes = make_human_demonstrations(args) if args.demos is None else read_demonstrations(args.demos, args.env_id)
+    if args.demos is None:
+        episodes = make_human_demonstrations(args)
+    else:
+        episodes = read_demonstrations(args.demos, args.env_id, args.demo_frames)
     available = sum(len(episode["actions"]) for episode in episodes)
     flag = "--demo-frames" if args.demos is None else f"--demos {args.demos}: --demo-frames"
     require(available >= args.demo_frames, flag, args.demo_frames, f"there are only {available}")

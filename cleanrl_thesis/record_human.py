@@ -54,6 +54,7 @@ import signal
 import socket
 import sys
 import time
+import warnings
 import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -81,7 +82,7 @@ class Args:
     verify: bool = False
     """play every recorded episode again and compare its rewards, instead of recording"""
     export_minari: str | None = None
-    """write the recordings as the Minari dataset of this id, instead of recording (`pip install "minari[create,hdf5]"`)"""
+    """write the recordings as the Minari dataset of this id, instead of recording (`pip install "minari[hdf5]"`)"""
     seed: int | None = None
     """seed of the episodes' seeds; default: fresh ones"""
     track_name: str = "meadow"
@@ -117,7 +118,7 @@ def first_line(error: Exception) -> str:
 
 
 def require(holds: bool, flag: str, value: object, allowed: str) -> None:
-    """Raise UsageError for a flag, its value and what is allowed, unless `holds`."""
+    """Raise UsageError naming the flag, its value and what is allowed, unless `holds`."""
     if not holds:
         raise UsageError(f"{flag} {value}".strip() + f": {allowed}")
 
@@ -137,8 +138,9 @@ def complete_args(args: Args) -> Args:
     if args.export_minari is not None:
         named = re.fullmatch(r"([\w-]+/)*[\w-]+-v\d+", args.export_minari) is not None
         require(named, "--export-minari", args.export_minari, "must be a Minari id as apple/anna-v0")
-        needs_minari = 'needs Minari: pip install "minari[create,hdf5]"'
-        require(importlib.util.find_spec("minari") is not None, "--export-minari", "", needs_minari)
+        needs_minari = 'needs Minari: pip install "minari[hdf5]"'
+        there = all(importlib.util.find_spec(name) is not None for name in ("minari", "h5py"))
+        require(there, "--export-minari", "", needs_minari)
     elif not args.verify:
         for name in ("fastapi", "uvicorn", "websockets"):
             allowed = "are needed for the page: pip install fastapi uvicorn websockets"
@@ -305,6 +307,7 @@ class Driving(Game):
         asked = np.clip([keys.along("right", "left") - keys.axes[0], keys.along("down", "up") + keys.axes[1]], -1, 1)
         asked[0] *= most
         reach = np.array([most / TURN_TIME, 1 / PEDAL_TIME]) / self.fps
+        self.hands[0] = np.clip(self.hands[0], -most, most)
         self.hands += np.clip(asked - self.hands, -reach, reach)
         return self.hands.astype(np.float32)
 
@@ -332,20 +335,18 @@ HUMAN_STREAM = 1_000_002
 
 
 def write_whole(path: Path, content: bytes, keep_old_as: str | None = None) -> None:
-    """Replace a file so that a crash leaves the old content or the new, never a part."""
-    new = path.with_name(path.name + ".tmp")
-    with open(new, "wb") as file:
+    """Write a file so that after a crash it is there whole or not at all; on request keep the one that it replaces."""
+    temporary = path.with_name(path.name + ".tmp")
+    with open(temporary, "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
     if keep_old_as is not None and path.exists():
         os.replace(path, path.with_name(keep_old_as))
-    os.replace(new, path)
+    os.replace(temporary, path)
     folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    os.fsync(folder)
+    os.close(folder)
 
 
 def write_json(path: Path, content: dict) -> None:
@@ -466,16 +467,18 @@ def export_minari(args: Args) -> int:
         columns = {"observations": np.stack(observations), "actions": episode["actions"]}
         columns |= {"rewards": episode["rewards"], "terminations": over[0], "truncations": over[1]}
         buffers.append(EpisodeBuffer(id=i, seed=int(episode["seed"]), **columns))
-    minari.create_dataset_from_buffers(
-        args.export_minari,
-        buffers,
-        observation_space=game.env.observation_space,
-        action_space=game.env.action_space,
-        algorithm_name=f"a person, {args.player}",
-        author=args.player,
-        description=f"{args.env_id} in the browser, {game.fps} frames a second",
-        jpeg_encoding=False,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of addresses that these recordings have none of
+        minari.create_dataset_from_buffers(
+            args.export_minari,
+            buffers,
+            observation_space=game.env.observation_space,
+            action_space=game.env.action_space,
+            algorithm_name=f"a person, {args.player}",
+            author=args.player,
+            description=f"{args.env_id} in the browser, {game.fps} frames a second",
+            jpeg_encoding=False,
+        )
     print(f"{args.export_minari}: {len(buffers)} episodes")
     return 0
 
@@ -650,6 +653,8 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
             return
         async with busy:
             await serve_player(websocket, game, recordings, seeds)
+        with contextlib.suppress(RuntimeError):  # the browser went first
+            await websocket.close()
 
     return app
 

@@ -122,7 +122,7 @@ def first_line(error: Exception) -> str:
 
 
 def require(holds: bool, flag: str, value: object, allowed: str) -> None:
-    """Raise UsageError for a flag, its value and what is allowed, unless `holds`."""
+    """Raise UsageError naming the flag, its value and what is allowed, unless `holds`."""
     if not holds:
         raise UsageError(f"{flag} {value}".strip() + f": {allowed}")
 
@@ -178,20 +178,18 @@ def load_method(name: str) -> ModuleType:
 
 
 def write_whole(path: Path, content: bytes, keep_old_as: str | None = None) -> None:
-    """Replace a file so that a crash leaves the old content or the new, never a part."""
-    new = path.with_name(path.name + ".tmp")
-    with open(new, "wb") as file:
+    """Write a file so that after a crash it is there whole or not at all; on request keep the one that it replaces."""
+    temporary = path.with_name(path.name + ".tmp")
+    with open(temporary, "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
     if keep_old_as is not None and path.exists():
         os.replace(path, path.with_name(keep_old_as))
-    os.replace(new, path)
+    os.replace(temporary, path)
     folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    os.fsync(folder)
+    os.close(folder)
 
 
 def write_json(path: Path, content: dict) -> None:

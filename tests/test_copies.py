@@ -8,12 +8,14 @@ from pathlib import Path
 METHODS = sorted(
     path for path in (Path(__file__).parent.parent / "cleanrl_thesis").glob("*.py") if path.name != "__init__.py"
 )
+TOOLS = [path for path in METHODS if path.stem in ("record_human", "sensitivity_test")]  # the same rule holds for them
 # (name, file): one line that says why it differs there; files with the same line have to be equal
 PPO, DQN, DISTILL = "ppo_continuous_kle.py", "dqn_apple.py", "distill_hybrid.py"
 GOPHER = "dqn_gopher.py"
 DDPG, GAIL = "ddpg_torcs_like.py", "gail_hybrid.py"
 ROOMS, HWM = "ppo_fourrooms.py", "hwm_segment.py"
 DREAMER, HWM_DREAMER, HRL = "dreamer_v2.py", "hwm_dreamer.py", "hwm_hrl_dreamer.py"
+RECORD, STUDY = "record_human.py", "sensitivity_test.py"
 DREAMERS = {  # of all three
     "Collector": "plays with the world model, into the replay",
     "Player": "holds what the world model believes",
@@ -100,6 +102,10 @@ DIFFERS: dict[tuple[str, str], str] = {
     **{(name, file): reason for name, reason in DREAMERS.items() for file in (DREAMER, HWM_DREAMER, HRL)},
     **{(name, file): reason for name, reason in HWM_AGENTS.items() for file in (HWM_DREAMER, HRL)},
     **{(name, HRL): "two levels" for name in ("Behaviour", "Dream", "imagine", "behaviour_loss")},
+    **{("cli", file): "no run, which could not go on" for file in (RECORD, STUDY)},
+    ("Player", RECORD): "a person in a browser",
+    ("make_app", STUDY): "of the study",
+    ("read_arrays", STUDY): "what is needed to play an episode again",
     ("Collector", HRL): "keeps the skills that are played",
     ("Player", HRL): "holds what the world model believes, and the skill",
 }

@@ -188,7 +188,7 @@ def test_recorded_images_must_be_bytes(tmp_path, monkeypatch):
     episodes[0]["observations"] = episodes[0]["observations"] / 255
     distill.write_demonstrations(tmp_path, episodes, {"env_id": "Quadrants-v0", "player": "a", "mode": "b"})
     with pytest.raises(distill.UsageError, match="must be uint8, they are float64"):
-        distill.read_demonstrations(tmp_path, "Quadrants-v0")
+        distill.read_demonstrations(tmp_path, "Quadrants-v0", 10**9)
 
 
 @pytest.mark.parametrize("states", ["human", "own"])

@@ -419,6 +419,25 @@ def test_recordings_of_gopher_are_played_again_and_learned_from(student, pixel_t
     assert (tmp_path / "run" / "updates.csv").read_bytes() == (student / "updates.csv").read_bytes()
 
 
+def test_frames_of_a_person_are_what_an_agent_would_see(student):
+    """Actions held for 4 frames, given as one for each frame: every fourth stack is the one that was seen."""
+    path = sorted((student / "demos").glob("*.npz"))[0]
+    with np.load(path, allow_pickle=False) as arrays:
+        episode = {name: arrays[name] for name in ("actions", "rewards", "seed", "emulator_state")}
+    game = dqn.make_atari("ALE/Gopher-v5")
+    count = 200
+    episode |= {name: episode[name][:count] for name in ("actions", "rewards")}
+    seen = distill.watch(game, episode)
+    single = dqn.make_atari("ALE/Gopher-v5", frame_skip=1)
+    single.reset(seed=int(episode["seed"]))
+    rewards = np.array([single.step(action)[1] for action in episode["actions"].repeat(4)])
+    frames = distill.watch_frames(game, {**episode, "actions": episode["actions"].repeat(4), "rewards": rewards})
+    assert frames.shape == (4 * count + 1, 4, 84, 84)
+    assert np.array_equal(frames[::4], seen)
+    rewards[100] += 1
+    assert distill.watch_frames(game, {**episode, "actions": episode["actions"].repeat(4), "rewards": rewards}) is None
+
+
 @pytest.mark.parametrize(
     "damage, words",
     [
@@ -426,9 +445,10 @@ def test_recordings_of_gopher_are_played_again_and_learned_from(student, pixel_t
         (lambda f: rewrite(f, lambda a: {**a, "emulator_state": a["emulator_state"][::-1]}), ["other rewards"]),
         (lambda f: rewrite(f, lambda a: {**a, "seed": np.array([1, 2])}), ["one seed"]),
         (lambda f: rewrite(f, lambda a: {k: v for k, v in a.items() if k != "seed"}), ["no demonstration"]),
-        (lambda f: edit_manifest(f, lambda m: m["options"].update(frame_skip=1)), ["frame_skip", "1"]),
+        (lambda f: edit_manifest(f, lambda m: m["options"].update(frame_skip=3)), ["frame_skip", "3"]),
+        (lambda f: edit_manifest(f, lambda m: m["options"].update(frame_skip=1)), ["other rewards"]),
     ],
-    ids=["actions", "state", "seeds", "none", "skip"],
+    ids=["actions", "state", "seeds", "none", "skip", "frames"],
 )
 def test_a_wrong_recording_is_named(damage, words, student, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
