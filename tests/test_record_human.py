@@ -52,9 +52,15 @@ class Browser:
         return self.client.websocket_connect("ws://127.0.0.1:8000/play", headers={"origin": HOME, **headers})
 
     @staticmethod
-    def until(socket, kind: str) -> dict:
+    def receive(socket) -> dict:
+        message = socket.receive()
+        if message["type"] == "websocket.close":
+            raise WebSocketDisconnect
+        return message
+
+    def until(self, socket, kind: str) -> dict:
         while True:
-            message = socket.receive()
+            message = self.receive(socket)
             if "text" in message and json.loads(message["text"])["kind"] == kind:
                 return json.loads(message["text"])
 
@@ -63,7 +69,7 @@ class Browser:
         self.until(socket, "ready")
         socket.send_json({"order": order})
         for pictures in itertools.count():
-            message = socket.receive()
+            message = self.receive(socket)
             if "text" in message and json.loads(message["text"])["kind"] == "over":
                 return json.loads(message["text"])
             if pictures % 25 == 0:
