@@ -617,7 +617,7 @@ def allowed_hosts(host: str) -> set[str] | None:
 
 def make_app(args: Args, game: Game, recordings: Recordings | None):
     """The web application: a page, and a websocket for one player at a time."""
-    from fastapi import FastAPI, Response, WebSocket
+    from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
     from fastapi.requests import HTTPConnection
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
@@ -653,7 +653,7 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
             return
         async with busy:
             await serve_player(websocket, game, recordings, seeds)
-        with contextlib.suppress(RuntimeError):  # the browser went first
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # the browser went first
             await websocket.close()
 
     return app
