@@ -324,7 +324,7 @@ def ask_script(run_dir: Path, clips: int) -> None:
         if name in ("run_dir", "resume", "save_demos") or value is None or flag not in help_text:
             continue
         flags += [flag if value else f"--no-{flag[2:]}"] if isinstance(value, bool) else [flag, str(value)]
-    print("asking", script.name, *flags)
+    print(f"{script.name} plays {2 * clips} episodes of {run_dir}", flush=True)
     done = subprocess.run(
         [sys.executable, script, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
