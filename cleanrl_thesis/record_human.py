@@ -660,12 +660,13 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket on that address. Raises UsageError."""
+    """A socket on that address, where browsers wait until `serve` answers. Raises UsageError."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+        listener.listen()
     except OSError as error:
         listener.close()
         raise UsageError(f"--host {host} --port {port}: cannot be listened on: {error.strerror}") from None
