@@ -56,8 +56,9 @@ def picture_recorder(browser, env_id: str) -> dict:
         page.click("#practice")
         page.wait_for_selector("#veil", state="hidden", timeout=15_000)
         known = len(page.evaluate("latencies"))
-        tap_keys(page, GAMES[env_id], SECONDS)
+        tap_keys(page, GAMES[env_id], SECONDS / 3)
         page.screenshot(path=OUT / f"record_{env_id.split('/')[-1].split('-')[0].lower()}.png")
+        tap_keys(page, GAMES[env_id], 2 * SECONDS / 3)
         new = page.evaluate("latencies")[known:]
         latencies += new
         median.append(round(statistics.median(new), 1))
