@@ -53,6 +53,7 @@ import secrets
 import signal
 import socket
 import sys
+import tempfile
 import time
 import warnings
 import zipfile
@@ -685,6 +686,16 @@ def serve(app, listener: socket.socket, host: str) -> None:
         uvicorn.Server(uvicorn.Config(app, **settings)).run(sockets=[listener])
 
 
+def make_folder(folder: Path) -> None:
+    """Make the folder of the recordings before anybody plays. Raises UsageError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UsageError(f"--out {folder}: cannot be written to: {error.strerror}") from None
+
+
 def main(args: Args) -> int:
     """Record, or read what was recorded. Returns the exit code."""
     args = complete_args(args)
@@ -695,9 +706,13 @@ def main(args: Args) -> int:
     game = make_game(args)
     recordings = None if args.practice else Recordings.open(args.out, about_recordings(args, game))
     listener = listen(args.host, args.port)
+    if recordings is not None:
+        make_folder(args.out)
     serve(make_app(args, game, recordings), listener, args.host)
     if recordings is not None:
         print(f"{args.out}: {len(recordings.files)} episodes")
+        if not recordings.files:
+            args.out.rmdir()
     return 0
 
 

@@ -469,7 +469,7 @@ class Clip:
 def find_clips(videos: Path, per_agent: int) -> list[Clip]:
     """All clips of the agents' folders: alike in length and size, and without metadata. Raises UsageError."""
     require(videos.is_dir(), "--videos", videos, "is no folder")
-    agents = sorted(path for path in videos.iterdir() if path.is_dir())
+    agents = sorted(path for path in videos.iterdir() if path.is_dir() and not path.name.startswith("."))
     require(bool(agents), "--videos", videos, "has no folder of an agent")
     clips, like = [], None
     for folder in agents:

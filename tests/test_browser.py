@@ -135,10 +135,16 @@ def test_a_round_whose_page_loses_focus_is_not_kept(tmp_path):
     with recorder(tmp_path / "anna", "AppleGame-v0") as page:
         page.click("#record")
         page.wait_for_selector("#veil", state="hidden", timeout=15_000)
+        page.keyboard.down("d")
         page.evaluate("window.dispatchEvent(new Event('blur'))")
         page.wait_for_selector("#record:enabled", timeout=5_000)
         assert "lost focus" in page.inner_text("#message") and "lost focus" in page.inner_text("#veil")
-    assert not (tmp_path / "anna").exists()
+        assert not list((tmp_path / "anna").iterdir())
+        page.click("#record")
+        page.wait_for_selector("#stop:visible")
+        page.wait_for_selector("#record:enabled", timeout=60_000)
+    with np.load(tmp_path / "anna" / "episode_00000.npz", allow_pickle=False) as arrays:
+        assert (arrays["actions"] == 4).all()  # the key that was down is not held any more
 
 
 class Server:
