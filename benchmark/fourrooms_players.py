@@ -5,7 +5,7 @@ for seed in 1 2 3; do
   python cleanrl_thesis/ppo_fourrooms.py --env-id FourRooms19-v0 --bf16 --total-timesteps 6000000 --hidden-size 256 \\
     --num-minibatches 32 --update-epochs 3 --learning-rate 7e-4 --seed $seed --save-model \\
     --run-dir runs/fourrooms/19_seed$seed --resume
-done
+done   # the slower of two seeds once more, with --seed 2 --total-timesteps 9000000
 python benchmark/fourrooms_players.py        # runs/fourrooms -> benchmark/results/fourrooms
 """
 
