@@ -14,7 +14,7 @@ format that `distill_hybrid.py --demos` and `gail_hybrid.py --demos-human` read.
 |---|---|
 | clock | this process': 60 frames a second, the driving task 50; the browser sends which keys are held, and shows pictures |
 | action | the keys that are held when the frame begins; Atari's games are played frame by frame, where agents act for 4 frames |
-| driving by keys | steering turns as far as the tyres can hold at that speed, pedals in 0.2 s; recorded is what the car was given |
+| driving by keys | steering turns within 0.25 s as far as half of the grip allows at that speed, pedals in 0.2 s; recorded is what the car was given |
 | an episode | is on disk before the next one begins; one that is broken off, or whose page loses focus, is not kept |
 | `t_ns` | when each action was taken, in nanoseconds from the episode's beginning |
 
@@ -270,11 +270,8 @@ class Atari(Game):
         return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
-KEYBOARD_GRIP, WHEELBASE, LOCK = (
-    14.0,
-    2.64,
-    math.radians(21),
-)  # m/s² that a keyboard may ask of the tyres, m, and the car's lock
+STEERING_GRIP = np.array([8.0, 14.0])  # m/s² that keys, and a gamepad, may ask of the tyres, which hold 15.7
+WHEELBASE, LOCK = 2.64, math.radians(21)  # m, and the car's greatest steering angle
 TURN_TIME, PEDAL_TIME = 0.25, 0.2  # s from the middle to the end
 SPEED_INDEX, SPEED_SCALE = 21, 300 / 3.6  # of the speed in the observation, in m/s
 
@@ -304,11 +301,11 @@ class Driving(Game):
 
     def action(self, keys: Keys) -> np.ndarray:
         """Move the hands towards where the keys, or the gamepad, ask for."""
-        most = min(1.0, KEYBOARD_GRIP * WHEELBASE / max(self.speed, 1.0) ** 2 / LOCK)
-        asked = np.clip([keys.along("right", "left") - keys.axes[0], keys.along("down", "up") + keys.axes[1]], -1, 1)
-        asked[0] *= most
-        reach = np.array([most / TURN_TIME, 1 / PEDAL_TIME]) / self.fps
-        self.hands[0] = np.clip(self.hands[0], -most, most)
+        by_keys, by_pad = np.minimum(STEERING_GRIP * WHEELBASE / max(self.speed, 1.0) ** 2 / LOCK, 1)
+        steering = keys.along("right", "left") * by_keys - keys.axes[0] * by_pad
+        asked = np.clip([steering, keys.along("down", "up") + keys.axes[1]], [-by_pad, -1], [by_pad, 1])
+        reach = np.array([by_keys / TURN_TIME, 1 / PEDAL_TIME]) / self.fps
+        self.hands[0] = np.clip(self.hands[0], -by_pad, by_pad)
         self.hands += np.clip(asked - self.hands, -reach, reach)
         return self.hands.astype(np.float32)
 
