@@ -57,6 +57,6 @@ $(VENV)/ready: pyproject.toml requirements.lock | $(VENV)/python
 	@touch $@
 
 $(VENV)/ready-test: $(VENV)/ready
-	@echo "downloading what the tests need, 0.2 GB, once"
+	@echo "downloading what the tests need, 0.3 GB, once"
 	$(INSTALL) --constraint requirements.lock --editable . --group test
 	@touch $@
