@@ -42,6 +42,7 @@ Each file follows from its seed and actions: `--verify` plays all of them again 
 # ///
 import asyncio
 import contextlib
+import fcntl
 import hashlib
 import importlib.util
 import io
@@ -367,7 +368,7 @@ class Recordings:
         if not folder.exists():
             return recordings
         require(folder.is_dir(), "--out", folder, "is not a folder")
-        paths = sorted(folder.glob("episode_*.npz"))
+        paths = sorted(path for path in folder.glob("episode_*.npz") if re.fullmatch(r"episode_\d{5}\.npz", path.name))
         manifest = folder / "manifest.json"
         if not manifest.exists():
             require(not any(folder.iterdir()), "--out", folder, "holds other files than recordings")
@@ -397,7 +398,7 @@ class Recordings:
             write_json(self.folder / "manifest.json", {"version": 1, **self.about, "files": {}})
         content = io.BytesIO()
         np.savez(content, **episode)
-        name = f"episode_{len(self.files):05d}.npz"
+        name = f"episode_{max((int(name[8:13]) for name in self.files), default=-1) + 1:05d}.npz"
         write_whole(self.folder / name, content.getvalue())
         self.files[name] = hashlib.sha256(content.getvalue()).hexdigest()
         self.scores.append(float(episode["rewards"].sum()))
@@ -408,8 +409,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a recorded episode. Raises UsageError."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
+            return {**arrays, "actions": arrays["actions"], "rewards": arrays["rewards"], "seed": arrays["seed"]}
+    except (KeyError, ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
         raise UsageError(f"--out {path}: no recording: {first_line(error)}") from None
 
 
@@ -484,7 +485,7 @@ def export_minari(args: Args) -> int:
 # ---------------------------------------------------------------------------------------------------------------------
 # Playing
 # ---------------------------------------------------------------------------------------------------------------------
-COUNTDOWN = 3  # s before a round
+COUNTDOWN, BUSY_TIME = 3, 1.0  # s before a round, and until a page that was just loaded anew is free
 MAX_BODY = 16_384  # bytes that a browser may send at once
 NAMES = {"left", "right", "up", "down", "fire"}
 
@@ -501,10 +502,13 @@ class Player:
         """Read messages until the browser is gone. One that is not understood ends the connection."""
         from fastapi import WebSocketDisconnect
 
+        expected = WebSocketDisconnect, RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError
         try:
             while True:
                 self.understand(json.loads(await self.websocket.receive_text()))
-        except (WebSocketDisconnect, RuntimeError, ValueError, KeyError, TypeError, AttributeError):
+        except expected:
+            pass
+        finally:
             self.gone = self.stopped = True
             self.orders.put_nowait("gone")
 
@@ -515,6 +519,7 @@ class Player:
             if order == "stop":
                 self.stopped = True
             elif order in ("practice", "record") and self.orders.empty():
+                self.stopped = False
                 self.orders.put_nowait(order)
             return
         axes = [min(max(float(x), -1.0), 1.0) for x in message["axes"]]
@@ -551,9 +556,10 @@ async def play_episode(game: Game, player: Player, seed: int) -> dict[str, np.nd
     await player.show(game.picture())
     for left in range(COUNTDOWN, 0, -1):
         await player.tell(kind="countdown", left=left)
-        await asyncio.sleep(1)
-        if player.stopped:
-            return None
+        for _ in range(20):
+            await asyncio.sleep(0.05)
+            if player.stopped:
+                return None
     await player.tell(kind="go")
     clock, begun = Clock(game.fps), time.perf_counter_ns()
     while True:
@@ -589,11 +595,15 @@ async def serve_player(websocket, game: Game, recordings: Recordings | None, see
             order = await player.orders.get()
             if player.gone:
                 return
-            player.stopped = False
             recorded = order == "record" and recordings is not None
             episode = await play_episode(game, player, int(seeds.spawn(1)[0].generate_state(1)[0]))
             if episode is not None and recorded:
-                recordings.add(episode)
+                try:
+                    recordings.add(episode)
+                except OSError as error:
+                    print(f"error: --out {recordings.folder}: {first_line(error)}", file=sys.stderr)
+                    await player.tell(kind="over", score=None, recorded=False, trouble=first_line(error))
+                    continue
             score = None if episode is None else float(episode["rewards"].sum())
             await player.tell(kind="over", score=score, recorded=recorded and episode is not None)
     except WebSocketDisconnect:
@@ -610,7 +620,7 @@ async def serve_player(websocket, game: Game, recordings: Recordings | None, see
 # ---------------------------------------------------------------------------------------------------------------------
 def allowed_hosts(host: str) -> set[str] | None:
     """Names by which browsers may call this server, against rebinding of foreign names; None: all."""
-    return None if host in ("0.0.0.0", "::") else {"127.0.0.1", "localhost", "[::1]", host}
+    return None if host in ("0.0.0.0", "::") else {"127.0.0.1", "localhost", "[::1]", host, f"[{host}]"}
 
 
 def make_app(args: Args, game: Game, recordings: Recordings | None):
@@ -632,7 +642,7 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
         if not is_known(connection):
             return Response("unknown host", 421)
         nonce = secrets.token_urlsafe(16)
-        policy = "default-src 'none'; connect-src 'self'; worker-src blob:; "
+        policy = "default-src 'none'; base-uri 'none'; frame-ancestors 'none'; connect-src 'self'; worker-src blob:; "
         policy += f"script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'"
         content = page.replace("{{nonce}}", nonce).replace("{{about}}", json.dumps(about).replace("<", "\\u003c"))
         headers = {"Content-Security-Policy": policy, "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
@@ -645,12 +655,16 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
             await websocket.close(1008)  # another site's page
             return
         await websocket.accept()
-        if busy.locked():
+        try:
+            await asyncio.wait_for(busy.acquire(), BUSY_TIME)
+        except TimeoutError:
             await websocket.send_json({"kind": "busy"})
             await websocket.close()
             return
-        async with busy:
+        try:
             await serve_player(websocket, game, recordings, seeds)
+        finally:
+            busy.release()
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # the browser went first
             await websocket.close()
 
@@ -675,7 +689,8 @@ def serve(app, listener: socket.socket, host: str) -> None:
     """Answer browsers until Ctrl-C or SIGTERM."""
     import uvicorn
 
-    print(f"open http://{host}:{listener.getsockname()[1]} in a browser; Ctrl-C ends", flush=True)
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+    print(f"open http://{name}:{listener.getsockname()[1]} in a browser; Ctrl-C ends", flush=True)
     settings = {"log_level": "warning", "access_log": False, "server_header": False, "date_header": False}
     settings |= {"ws_max_size": MAX_BODY, "ws_per_message_deflate": False, "timeout_graceful_shutdown": 1}
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -684,11 +699,13 @@ def serve(app, listener: socket.socket, host: str) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder of the recordings before anybody plays. Raises UsageError."""
+    """Make the folder of the recordings before anybody plays, and keep others out of it. Raises UsageError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            pass
+            fcntl.flock(os.open(folder, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UsageError(f"--out {folder}: another recorder is running in it") from None
     except OSError as error:
         raise UsageError(f"--out {folder}: cannot be written to: {error.strerror}") from None
 
@@ -701,10 +718,10 @@ def main(args: Args) -> int:
     if args.export_minari is not None:
         return export_minari(args)
     game = make_game(args)
-    recordings = None if args.practice else Recordings.open(args.out, about_recordings(args, game))
-    listener = listen(args.host, args.port)
-    if recordings is not None:
+    listener, recordings = listen(args.host, args.port), None
+    if not args.practice:
         make_folder(args.out)
+        recordings = Recordings.open(args.out, about_recordings(args, game))
     serve(make_app(args, game, recordings), listener, args.host)
     if recordings is not None:
         print(f"{args.out}: {len(recordings.files)} episodes")

@@ -14,7 +14,7 @@ own script is asked for episodes, or one of videos. All are drawn by the same re
 | double-blind | a clip's address is drawn at random for each participant; whose it is, is joined at `--export` alone | ours |
 | what is stored | age and gender if given, verdicts, comments; no name, address or time | ours |
 | an answer | is on disk when the page goes on; sent twice, it counts once and the first one stays | ours |
-| interval | 95%, bootstrap over participants, for each judges several clips; where all agree, the exact bound for a share that no one, or everyone, has | ours |
+| interval | 95%, bootstrap over participants, for each judges several clips; where all have the same share, Wilson's for so many participants | ours |
 """
 
 # /// script
@@ -43,6 +43,7 @@ import importlib.util
 import io
 import itertools
 import json
+import math
 import os
 import random
 import re
@@ -51,9 +52,11 @@ import shutil
 import signal
 import socket
 import sqlite3
+import statistics
 import struct
 import subprocess
 import sys
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -127,6 +130,14 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
         raise UsageError(f"{flag} {value}".strip() + f": {allowed}")
 
 
+def read_text(path: Path, flag: str) -> str:
+    """A text file in UTF-8. Raises UsageError."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{flag} {path}: cannot be read: {first_line(error)}") from None
+
+
 def complete_args(args: Args) -> Args:
     """Check all. Raises UsageError."""
     require(not (args.prepare and args.export), "--prepare --export", "", "must be given alone")
@@ -143,6 +154,11 @@ def complete_args(args: Args) -> Args:
         require(named, "--prepare", agent, "must be NAME=FOLDER, the name of letters, digits, -, _ and .")
     require(len(set(names)) == len(names), "--prepare", " ".join(args.prepare), "names an agent twice")
     require(args.practice is None or bool(args.prepare), "--practice", args.practice, "belongs to --prepare")
+    require("practice" not in names, "--prepare", "practice", "cannot be an agent's name")
+    for agent in args.prepare:
+        require(Path(agent.partition("=")[2]).is_dir(), "--prepare", agent, "is no folder")
+    require(args.videos is None or not args.videos.is_file(), "--videos", args.videos, "is a file, not a folder")
+    require(args.export is None or not args.export.is_file(), "--export", args.export, "is a file, not a folder")
     if args.consent is not None:
         require(args.consent.is_file(), "--consent", args.consent, "is no file")
     if args.prepare and importlib.util.find_spec("imageio_ffmpeg") is None:
@@ -335,15 +351,15 @@ def ask_script(run_dir: Path, clips: int) -> None:
 def choose_windows(
     lengths: dict[Path, int], frames: int, clips: int, rng: np.random.Generator
 ) -> list[tuple[Path, int]]:
-    """Where clips of so many frames begin: in as many episodes as there are, without overlap in one."""
-    rounds: list[list[tuple[Path, int]]] = []
-    for path in rng.permutation(np.array(list(lengths), object)):
-        spare, count = lengths[path] % frames, lengths[path] // frames
-        first = int(rng.integers(spare + 1)) if count else 0
-        for i, window in enumerate(rng.permutation(count).tolist()):
-            rounds += [[]] if len(rounds) <= i else []
-            rounds[i].append((path, first + window * frames))
-    return [window for windows in rounds for window in windows][:clips]
+    """Where clips of so many frames begin: at random moments of as many episodes as there are, without overlap in one."""
+    paths = [Path(path) for path in rng.permutation([str(path) for path in lengths])]
+    turns = [path for turn in range(clips) for path in paths if lengths[path] >= (turn + 1) * frames][:clips]
+    windows = []
+    for path in dict.fromkeys(turns):
+        count = turns.count(path)
+        starts = np.sort(rng.integers(0, lengths[path] - count * frames + 1, count)) + np.arange(count) * frames
+        windows += [(path, int(start)) for start in starts]
+    return windows
 
 
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
@@ -375,36 +391,47 @@ def prepare(args: Args) -> int:
     if args.practice is not None:
         sources["practice"] = args.practice
     plays = {name: find_play(folder, args.clips) for name, folder in sources.items()}
-    for what, values in (
-        ("games", {p.env_id for p in plays.values()}),
-        ("frame rates", {p.fps for p in plays.values()}),
-    ):
+    roads = {str(play.options.get("track", "")) for play in plays.values()}
+    games, rates = {play.env_id or "videos" for play in plays.values()}, {play.fps for play in plays.values()}
+    for what, values in (("games", games), ("frame rates", rates), ("roads", roads)):
         require(len(values) == 1, "--prepare", " ".join(args.prepare), f"are of different {what}: {sorted(values)}")
     env_id, fps = next(iter(plays.values())).env_id, next(iter(plays.values())).fps
     seconds = args.seconds or (30 if env_id == "TorcsLike-v0" else 15)
+    require(seconds * fps >= 1, "--seconds", seconds, f"must be at least a frame, 1/{fps:g} s")
     rng, cuts = np.random.default_rng(args.seed), {}
     for name, play in plays.items():
         count = 1 if name == "practice" else args.clips
         cuts[name] = choose_windows(play.lengths, round(seconds * fps), count, rng)
         allowed = f"has {len(cuts[name])} clips of {seconds:g} s, needs {count}: --clips or --seconds may be less"
         require(len(cuts[name]) == count, "--prepare", f"{name}={sources[name]}", allowed)
-    new, made = args.videos.with_name(args.videos.name + ".tmp"), []
-    shutil.rmtree(new, ignore_errors=True)
+    args.videos.parent.mkdir(parents=True, exist_ok=True)
+    new = Path(tempfile.mkdtemp(prefix=f"{args.videos.name}.", dir=args.videos.parent))
+    try:
+        cut_clips(new, args, plays, cuts, seconds)
+        if args.videos.exists():
+            args.videos.rmdir()
+        os.replace(new, args.videos)
+        args.videos.chmod(0o755)
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    return 0
+
+
+def cut_clips(folder: Path, args: Args, plays: dict[str, Play], cuts: dict[str, list], seconds: float) -> None:
+    """Write the clips of all agents, the rules, and whence each clip comes."""
+    made = []
     for name, windows in cuts.items():
         for i, (path, start) in enumerate(windows):
-            clip = new / ("practice.mp4" if name == "practice" else f"{name}/{i:03d}.mp4")
-            clip.parent.mkdir(parents=True, exist_ok=True)
+            clip, fps = folder / ("practice.mp4" if name == "practice" else f"{name}/{i:03d}.mp4"), plays[name].fps
+            clip.parent.mkdir(exist_ok=True)
             write_clip(clip, plays[name].frames(path, start, round(seconds * fps)), fps)
-            made.append({"clip": str(clip.relative_to(new)), "from": path.name, "second": round(start / fps, 2)})
+            made.append({"clip": str(clip.relative_to(folder)), "from": path.name, "second": round(start / fps, 2)})
         print(f"{name}: {len(windows)} clip{'s' * (len(windows) > 1)} of {seconds:g} s")
+    env_id = next(iter(plays.values())).env_id
     if env_id in RULES:
-        write_whole(new / "rules.txt", (RULES[env_id] + "\n").encode())
-    write_json(new / "prepared.json", {"env_id": env_id, "seed": args.seed, "clips": made})
-    find_clips(new, 1)
-    if args.videos.exists():
-        args.videos.rmdir()
-    os.replace(new, args.videos)
-    return 0
+        write_whole(folder / "rules.txt", (RULES[env_id] + "\n").encode())
+    write_json(folder / "prepared.json", {"env_id": env_id, "seed": args.seed, "clips": made})
+    find_clips(folder, 1)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -443,18 +470,19 @@ def without_metadata(content: bytes) -> bytes:
     return bytes(clean)
 
 
-def describe_clip(content: bytes) -> tuple[float, int, int]:
-    """Seconds, width and height of an MP4 file. Raises ValueError where it is none, or holds metadata."""
+def describe_clip(content: bytes) -> tuple[float, int, int, int]:
+    """Seconds, width, height and number of frames of an MP4 file. Raises ValueError where it is none, or holds metadata."""
     found = {kind: content[start:end] for kind, start, end in boxes(content)}
-    if not {b"mvhd", b"tkhd"} <= found.keys():
+    if not {b"mvhd", b"tkhd", b"stsz"} <= found.keys():
         raise ValueError("no MP4 video, or cut off")
     if METADATA & found.keys():
         raise ValueError("holds metadata, which could tell the agent")
     created, _, scale, duration = struct.unpack_from(">QQIQ" if found[b"mvhd"][0] else ">IIII", found[b"mvhd"], 4)
-    if created:
+    times = [found[kind][4:12] if found[kind][0] else found[kind][4:8] for kind in (b"tkhd", b"mdhd") if kind in found]
+    if created or any(map(any, times)):
         raise ValueError("holds the time at which it was made, which could tell the agent")
     width, height = struct.unpack_from(">II", found[b"tkhd"], len(found[b"tkhd"]) - 8)
-    return duration / scale, width >> 16, height >> 16
+    return duration / scale, width >> 16, height >> 16, struct.unpack_from(">I", found[b"stsz"], 8)[0]
 
 
 @dataclass
@@ -480,16 +508,15 @@ def find_clips(videos: Path, per_agent: int) -> list[Clip]:
             require(is_inside, "--videos", path, "is a link, or no file")
             content = path.read_bytes()
             try:
-                seconds, width, height = describe_clip(content)
+                found = describe_clip(content)
             except (ValueError, struct.error) as error:
                 message = first_line(error)
                 raise UsageError(f"--videos {path}: {message}; --prepare makes clips that tell nothing") from None
-            like = like or (path, seconds, width, height)
-            same = abs(seconds - like[1]) < 0.05 and (width, height) == like[2:]
-            allowed = f"is {seconds:.2f} s of {width} x {height}, but {like[0].name} of {like[0].parent.name} is"
-            require(
-                same, "--videos", path, f"{allowed} {like[1]:.2f} s of {like[2]} x {like[3]}: it could tell the agent"
-            )
+            like = like or (path, found)
+            same = abs(found[0] - like[1][0]) < 0.05 and found[1:] == like[1][1:]
+            allowed = "is {:.2f} s of {} x {}, {} frames".format(*found)
+            other = "but {}/{} is {:.2f} s of {} x {}, {} frames".format(like[0].parent.name, like[0].name, *like[1])
+            require(same, "--videos", path, f"{allowed}, {other}: it could tell the agent")
             clips.append(Clip(folder.name, path, hashlib.sha256(content).hexdigest()))
     return clips
 
@@ -610,13 +637,14 @@ RESAMPLES, LEVEL = 10_000, 0.95
 def interval(human: np.ndarray, judged: np.ndarray, seed: int) -> tuple[float, float]:
     """Interval of the share `human.sum() / judged.sum()`, counts of each participant (P,).
 
-    By bootstrap over participants. Where no one, or everyone, says human, resamples are all alike: then the exact
-    (Clopper-Pearson) bound of P participants of whom none does.
+    By bootstrap over participants. Where all of them have the same share, resamples are all alike: then Wilson's interval for
+    P participants.
     """
     tail, people = (1 - LEVEL) / 2, len(judged)
-    if human.sum() in (0, judged.sum()):
-        bound = 1 - tail ** (1 / people)
-        return (0.0, bound) if human.sum() == 0 else (1 - bound, 1.0)
+    if np.ptp(human / judged) == 0:
+        share, z2 = human.sum() / judged.sum(), statistics.NormalDist().inv_cdf(1 - tail) ** 2 / people
+        middle, half = share + z2 / 2, math.sqrt(share * (1 - share) * z2 + z2 * z2 / 4)
+        return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
     draws = np.random.default_rng(seed).integers(people, size=(RESAMPLES, people))
     shares = human[draws].sum(1) / judged[draws].sum(1)
     low, high = np.quantile(shares, (tail, 1 - tail))
@@ -626,7 +654,7 @@ def interval(human: np.ndarray, judged: np.ndarray, seed: int) -> tuple[float, f
 def guarded(text: object) -> str:
     """Text of a cell that no spreadsheet takes for a formula."""
     text = "" if text is None else str(text)
-    return "'" + text if text.lstrip()[:1] in ("=", "+", "-", "@") or text[:1] in ("\t", "\r", "\n") else text
+    return re.sub(r"(^|[\t\r\n;])(?=\s*[=+\-@\uff1d\uff0b\uff0d\uff20])|^(?=[\t\r\n])", r"\1'", text)
 
 
 def write_csv(path: Path, rows: list[dict]) -> None:
@@ -691,7 +719,7 @@ GENDERS = Literal["female", "male", "another"]
 
 def allowed_hosts(host: str) -> set[str] | None:
     """Names by which browsers may call this server, against rebinding of foreign names; None: all."""
-    return None if host in ("0.0.0.0", "::") else {"127.0.0.1", "localhost", "[::1]", host}
+    return None if host in ("0.0.0.0", "::") else {"127.0.0.1", "localhost", "[::1]", host, f"[{host}]"}
 
 
 def video_response(content: bytes, asked: str | None):
@@ -712,6 +740,7 @@ def video_response(content: bytes, asked: str | None):
 def make_app(args: Args, clips: list[Clip]):
     """The web application: a page, three requests of it, and the clips."""
     from fastapi import FastAPI, HTTPException, Request, Response
+    from fastapi.exceptions import RequestValidationError
     from pydantic import BaseModel, Field
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
@@ -719,9 +748,9 @@ def make_app(args: Args, clips: list[Clip]):
     paths = {clip.sha256: clip.path for clip in clips}
     rules, practice = args.videos / "rules.txt", args.videos / "practice.mp4"
     about = {
-        "consent": None if args.consent is None else args.consent.read_text(),
+        "consent": None if args.consent is None else read_text(args.consent, "--consent"),
         "contact": args.contact,
-        "rules": rules.read_text() if rules.is_file() else "",
+        "rules": read_text(rules, "--videos") if rules.is_file() else "",
         "practice": practice.is_file(),
         "clips": len({clip.agent for clip in clips}) * args.clips_per_agent,
         "seconds": round(describe_clip(clips[0].path.read_bytes())[0]),
@@ -739,11 +768,18 @@ def make_app(args: Args, clips: list[Clip]):
         verdict: Literal["human", "machine"]
         why: str = Field(default="", max_length=MAX_COMMENT)
 
+    @app.exception_handler(RequestValidationError)
+    def refuse(request: Request, error: RequestValidationError) -> Response:
+        return Response("not understood", 422)  # without what was sent, which may have no encoding
+
     @app.middleware("http")
     async def guard(request: Request, call_next) -> Response:
         name = re.sub(r":\d+$", "", request.headers.get("host", ""))
         if hosts is not None and name not in hosts:
             return Response("unknown host", 421)
+        origin = request.headers.get("origin")
+        if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
+            return Response("another site's page", 403)
         length = request.headers.get("content-length", "0" if request.method in ("GET", "HEAD") else "")
         if "transfer-encoding" in request.headers or not length.isdecimal():
             return Response("needs Content-Length", 411)
@@ -757,7 +793,7 @@ def make_app(args: Args, clips: list[Clip]):
     @app.get("/")
     def show_page() -> Response:
         nonce = secrets.token_urlsafe(16)
-        policy = "default-src 'none'; connect-src 'self'; media-src 'self'; form-action 'none'; "
+        policy = "default-src 'none'; base-uri 'none'; frame-ancestors 'none'; connect-src 'self'; media-src 'self'; form-action 'none'; "
         policy += f"script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'"
         content = page.replace("{{nonce}}", nonce).replace("{{about}}", json.dumps(about).replace("<", "\\u003c"))
         headers = {"Content-Security-Policy": policy, "Cache-Control": "no-store"}
@@ -818,7 +854,8 @@ def serve(app, listener: socket.socket, host: str) -> None:
     """Answer browsers until Ctrl-C or SIGTERM."""
     import uvicorn
 
-    print(f"open http://{host}:{listener.getsockname()[1]} in a browser; Ctrl-C ends", flush=True)
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+    print(f"open http://{name}:{listener.getsockname()[1]} in a browser; Ctrl-C ends", flush=True)
     settings = {"log_level": "warning", "access_log": False, "server_header": False, "date_header": False}
     settings |= {"ws_max_size": MAX_BODY, "ws_per_message_deflate": False, "timeout_graceful_shutdown": 1}
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -834,8 +871,9 @@ def main(args: Args) -> int:
     if args.export is not None:
         return export(args)
     clips = find_clips(args.videos, args.clips_per_agent)
+    app, listener = make_app(args, clips), listen(args.host, args.port)
     open_database(args.db, clips)
-    serve(make_app(args, clips), listen(args.host, args.port), args.host)
+    serve(app, listener, args.host)
     return 0
 
 

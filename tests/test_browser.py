@@ -183,7 +183,7 @@ async def participate(browser, address: str, number: int, judged: list) -> tuple
                 await page.click("#start")
         while not await page.is_visible("#question"):
             if await page.is_enabled("#play"):
-                await page.click("#play")
+                await page.click("#play", timeout=60_000)
             await page.wait_for_timeout(200)
         verdict, why = rng.choice(["human", "machine"]), f"{number}: {shown}"
         await page.click(f"[data-verdict={verdict}]")

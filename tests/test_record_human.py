@@ -289,6 +289,7 @@ def test_pages_of_other_sites_are_refused(headers):
         '{"held": ["left"]}',
         '{"held": 3, "axes": [0, 0], "seq": 1}',
         '{"held": [], "axes": [NaN, 0], "seq": 1}',
+        '{"held": [], "axes": [0, 0], "seq": 1e999}',
     ],
 )
 def test_what_is_not_understood_ends_the_connection(message, at_once):

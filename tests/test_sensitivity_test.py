@@ -1,5 +1,6 @@
 """The study: clips that tell nothing, answers that count once, the table's numbers, and what strangers may not do."""
 
+import contextlib
 import csv
 import itertools
 import json
@@ -15,7 +16,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import scipy.stats
-from conftest import ROOT, assert_refused, run
+from conftest import ROOT, assert_refused, edit_manifest, run
 from fastapi.testclient import TestClient
 
 from cleanrl_thesis import ddpg_torcs_like as ddpg
@@ -99,11 +100,14 @@ def test_windows_do_not_overlap_and_come_from_many_episodes():
             assert path != other or abs(start - other_start) >= frames
         long_enough = sum(length >= frames for length in lengths.values())
         assert len({path for path, _ in windows}) == min(len(windows), long_enough)
+    episodes = {Path(str(i)): 1_800 for i in range(200)}
+    starts = [start for _, start in study.choose_windows(episodes, 900, 200, rng)]
+    assert scipy.stats.kstest(starts, "uniform", (0, 900)).pvalue > 0.001
 
 
 def test_clips_have_the_length_asked_for_and_hold_nothing_else(drawn_clips):
     content = (drawn_clips / "dqn" / "000.mp4").read_bytes()
-    assert study.describe_clip(content) == (1.0, 64, 48)
+    assert study.describe_clip(content) == (1.0, 64, 48, 12)
     about = subprocess.run(
         [imageio_ffmpeg.get_ffmpeg_exe(), "-i", drawn_clips / "dqn" / "000.mp4"], capture_output=True, text=True
     ).stderr
@@ -143,6 +147,14 @@ def linked(path: Path) -> None:
     path.symlink_to(path.parent.parent.parent / "outside.mp4")
 
 
+def test_agents_on_different_roads_are_refused(tmp_path, capsys):
+    for name, track in (("a", "meadow"), ("b", "hills")):
+        record_apple(tmp_path / name)
+        edit_manifest(tmp_path / name, lambda m: m.update(env_id="TorcsLike-v0", options={"track": track}))  # noqa: B023
+    flags = ["--videos", tmp_path / "out", "--prepare", f"a={tmp_path / 'a'}", f"b={tmp_path / 'b'}"]
+    assert_refused(study, capsys, flags, ["--prepare", "roads", "hills", "meadow"])
+
+
 @pytest.mark.parametrize(
     "damage, words",
     [
@@ -150,6 +162,7 @@ def linked(path: Path) -> None:
         (lambda p: tagged(p, "-fflags", "+bitexact", "-metadata", "creation_time=2020-01-01"), ["tell the agent"]),
         (stretched, ["1.17 s", "1.00 s"]),
         (enlarged, ["64 x 64", "64 x 48"]),
+        (lambda p: study.write_clip(p, pictures(1, 24), 24), ["24 frames", "12 frames"]),
         (linked, ["link"]),
         (lambda p: p.write_bytes(p.read_bytes()[:-100]), ["cut off"]),
         (lambda p: p.write_bytes(b"no video"), ["no MP4 video"]),
@@ -158,7 +171,7 @@ def linked(path: Path) -> None:
         (lambda p: shutil.copy(p.parent / "001.mp4", p), ["the same clip twice"]),
         (lambda p: shutil.rmtree(p.parent.parent), ["no folder"]),
     ],
-    ids=["title", "time", "length", "size", "link", "cut", "text", "empty", "few", "twice", "folder"],
+    ids=["title", "time", "length", "size", "speed", "link", "cut", "text", "empty", "few", "twice", "folder"],
 )
 def test_clips_that_could_tell_the_agent_are_refused(damage, words, videos, capsys):
     damage(videos / "human" / "002.mp4")
@@ -237,7 +250,10 @@ def test_driving_is_drawn(tmp_path):
 @pytest.mark.parametrize(
     "flags, words",
     [
-        (["a=anna", "b=nowhere"], ["--prepare", "nowhere", "no demonstrations"]),
+        (["a=anna", "b=nowhere"], ["--prepare", "nowhere", "no folder"]),
+        (["a=anna", "b=empty"], ["--prepare", "empty", "no demonstrations"]),
+        (["a=anna", "practice=anna"], ["--prepare", "practice"]),
+        (["a=anna", "--seconds", 0.001], ["--seconds", "0.001", "1/60"]),
         (["a=anna", "--clips", 99], ["--prepare", "a=anna", "needs 99"]),
         (["a=anna", "--seconds", 31], ["a=anna", "0 clips of 31 s"]),
         (["a=anna", "--seconds", 0], ["--seconds", "0.0"]),
@@ -255,9 +271,10 @@ def test_what_cannot_be_cut_is_refused_and_leaves_nothing(flags, words, tmp_path
     shutil.copytree("anna", "damaged")
     Path("damaged/episode_00000.npz").write_bytes(b"x")
     Path("unfinished").mkdir()
+    Path("empty").mkdir()
     Path("unfinished/args.json").write_text('{"exp_name": "dqn_apple"}')
     assert_refused(study, capsys, ["--videos", "out", "--prepare", *flags], words)
-    assert sorted(os.listdir()) == ["anna", "damaged", "unfinished"]
+    assert sorted(os.listdir()) == ["anna", "damaged", "empty", "unfinished"]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -329,11 +346,16 @@ def test_answers_to_clips_that_are_not_shown_are_refused(videos):
         ("/answer", {"key": key_of(1), "address": "x", "verdict": "human", "why": "x" * 2_001}),
         ("/answer", {"key": key_of(1), "address": ["x"], "verdict": "human"}),
         ("/join", []),
+        ("/answer", b'{"key": "' + key_of(1).encode() + b'", "address": "x", "verdict": "human", "why": "\\ud800"}'),
+        ("/join", b'{"key": "' + key_of(1).encode() + b'", "age": NaN}'),
+        ("/join", b"no json"),
     ],
 )
 def test_what_is_not_understood_is_refused(path, body, videos):
     client, db = open_study(videos)
-    assert client.post(path, json=body).status_code == 422
+    content = body if isinstance(body, bytes) else json.dumps(body).encode()
+    answer = client.post(path, content=content, headers={"content-type": "application/json"})
+    assert answer.status_code == 422
     assert rows(db, "SELECT COUNT(*) FROM participants") == [(0,)]
 
 
@@ -380,12 +402,12 @@ def test_interval_is_that_of_all_resamples():
     assert study.interval(*data, 1) == pytest.approx((theirs.low, theirs.high), abs=0.02)
 
 
-@pytest.mark.parametrize("people", [1, 5, 26])
-def test_interval_where_all_agree_is_clopper_and_pearsons(people):
+@pytest.mark.parametrize("people, half", [(1, 0), (5, 0), (26, 0), (26, 1), (4, 1), (26, 2), (3, 2)])
+def test_interval_where_all_are_alike_is_wilsons(people, half):
+    """No one, everyone, or each once in two: the interval that so many participants would give with one answer each."""
     judged = np.full(people, 2)
-    none, everyone = study.interval(0 * judged, judged, 1), study.interval(judged, judged, 1)
-    assert none == pytest.approx(tuple(scipy.stats.binomtest(0, people).proportion_ci(0.95, "exact")))
-    assert everyone == pytest.approx(tuple(scipy.stats.binomtest(people, people).proportion_ci(0.95, "exact")))
+    expected = scipy.stats.binomtest(half * people // 2, people).proportion_ci(0.95, "wilson")
+    assert study.interval(np.full(people, half), judged, 1) == pytest.approx(tuple(expected), abs=1e-9)
 
 
 def test_export_counts_as_by_hand(videos, tmp_path, capsys):
@@ -432,9 +454,17 @@ def test_comments_stay_text_and_no_formula(videos, tmp_path):
     assert study.cli(["--db", str(db), "--export", str(tmp_path)]) == 0
     with open(tmp_path / "comments.csv", newline="") as file:
         found = [row["comment"] for row in csv.DictReader(file)]
-    assert found == ["'" + comments[0], "'" + comments[1], *comments[2:4], "'" + comments[4], comments[5]]
-    for text in ("-1", "@x", "  =1", "\rx", "\nx"):
+    assert found == [
+        "'" + comments[0],
+        "'" + comments[1],
+        "'); DROP TABLE trials;' --",
+        comments[3],
+        "'" + comments[4],
+        comments[5],
+    ]
+    for text in ("-1", "@x", "  =1", "\rx", "\nx", "\uff1d1"):
         assert study.guarded(text) == "'" + text
+    assert study.guarded("nice; =1+1") == "nice;' =1+1" and study.guarded("a\n=1") == "a\n'=1"
     assert study.guarded("a = b") == "a = b" and study.guarded(None) == ""
 
 
@@ -443,10 +473,11 @@ def test_comments_stay_text_and_no_formula(videos, tmp_path):
 # ---------------------------------------------------------------------------------------------------------------------
 def test_it_listens_on_this_machine_unless_told_otherwise():
     assert study.Args().host == "127.0.0.1"
-    listener = study.listen("127.0.0.1", 0)
-    with pytest.raises(study.UsageError, match="cannot be listened on"):
-        study.listen("127.0.0.1", listener.getsockname()[1])
-    listener.close()
+    with contextlib.closing(study.listen(study.Args().host, 0)) as listener:
+        address, port = listener.getsockname()
+        assert address == "127.0.0.1"
+        with pytest.raises(study.UsageError, match="cannot be listened on"):
+            study.listen("127.0.0.1", port)
     assert study.allowed_hosts("0.0.0.0") is None
 
 
@@ -477,6 +508,7 @@ def test_requests_are_bounded_and_hosts_known(videos):
     assert client.post("/join", content=b"x" * 20_000).status_code == 413
     assert client.post("/join", content=iter([b"x" * 10] * 10)).status_code == 411
     assert client.get("/", headers={"host": "evil.example"}).status_code == 421
+    assert client.post("/join", json={"key": key_of(1)}, headers={"origin": "http://evil.example"}).status_code == 403
     assert client.post("/join", json={"key": key_of(1)}, headers={"host": "evil.example"}).status_code == 421
     open_client, _ = open_study(videos, host="0.0.0.0")
     assert open_client.get("/", headers={"host": "lab.example"}).status_code == 200
