@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import websockets.exceptions
+import websockets.sync.client
 from conftest import ROOT, command
 from playwright.async_api import async_playwright
 from playwright.sync_api import sync_playwright
@@ -145,6 +147,18 @@ def test_a_round_whose_page_loses_focus_is_not_kept(tmp_path):
         page.wait_for_selector("#record:enabled", timeout=60_000)
     with np.load(tmp_path / "anna" / "episode_00000.npz", allow_pickle=False) as arrays:
         assert (arrays["actions"] == 4).all()  # the key that was down is not held any more
+
+
+def test_a_message_that_is_too_large_ends_the_connection(tmp_path):
+    process, address = start(RECORD, "--practice", "--port", 0)
+    with websockets.sync.client.connect(address.replace("http", "ws") + "/play", origin=address) as socket:
+        assert "ready" in socket.recv()
+        socket.send("x" * (record.MAX_BODY + 1))
+        with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
+            socket.recv()
+        assert closed.value.rcvd.code == 1009
+    process.terminate()
+    assert process.wait(10) == 0
 
 
 class Server:
