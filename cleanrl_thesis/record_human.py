@@ -631,7 +631,7 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     page, hosts, busy = Path(__file__).with_suffix(".html").read_text(), allowed_hosts(args.host), asyncio.Lock()
     seeds = np.random.SeedSequence(None if args.seed is None else [args.seed, HUMAN_STREAM])
-    about = {"title": args.env_id, "rules": game.rules, "keys": game.keys, "unit": game.unit, "fps": game.fps}
+    about = {"title": args.env_id, "rules": game.rules, "keys": game.keys, "unit": game.unit}
 
     def is_known(connection: HTTPConnection) -> bool:
         name = re.sub(r":\d+$", "", connection.headers.get("host", ""))
@@ -639,6 +639,7 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
 
     @app.get("/")
     def show_page(connection: HTTPConnection) -> Response:
+        """The page; only its own script and style may run in it."""
         if not is_known(connection):
             return Response("unknown host", 421)
         nonce = secrets.token_urlsafe(16)
@@ -725,7 +726,7 @@ def main(args: Args) -> int:
     serve(make_app(args, game, recordings), listener, args.host)
     if recordings is not None:
         print(f"{args.out}: {len(recordings.files)} episodes")
-        if not recordings.files:
+        with contextlib.suppress(OSError):  # it is not empty
             args.out.rmdir()
     return 0
 

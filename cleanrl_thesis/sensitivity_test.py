@@ -444,12 +444,10 @@ METADATA = {b"udta", b"meta", b"uuid"}
 def boxes(content: bytes, at: int = 0, end: int | None = None) -> Iterator[tuple[bytes, int, int]]:
     """The boxes of an MP4 file (ISO 14496-12), and those within: kind, and where its inside begins and ends.
 
-    Raises ValueError where one is cut off.
+    Raises ValueError or struct.error where one is cut off.
     """
     end = len(content) if end is None else end
     while at < end:
-        if at + 16 > end and at + 8 != end:
-            raise ValueError("no MP4 video, or cut off")
         size, kind = struct.unpack_from(">I4s", content, at)
         head = 16 if size == 1 else 8
         size = struct.unpack_from(">Q", content, at + 8)[0] if size == 1 else size or end - at
@@ -471,7 +469,10 @@ def without_metadata(content: bytes) -> bytes:
 
 
 def describe_clip(content: bytes) -> tuple[float, int, int, int]:
-    """Seconds, width, height and number of frames of an MP4 file. Raises ValueError where it is none, or holds metadata."""
+    """Seconds, width, height and number of frames of an MP4 file.
+
+    Raises ValueError or struct.error where it is none, is cut off, or holds metadata.
+    """
     found = {kind: content[start:end] for kind, start, end in boxes(content)}
     if not {b"mvhd", b"tkhd", b"stsz"} <= found.keys():
         raise ValueError("no MP4 video, or cut off")
