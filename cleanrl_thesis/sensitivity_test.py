@@ -738,6 +738,32 @@ def video_response(content: bytes, asked: str | None):
     return Response(content[first : last + 1], 206, media_type="video/mp4", headers=headers)
 
 
+def refused(method: str, headers, hosts: set[str] | None) -> tuple[int, str] | None:
+    """Status and reason where a request is of a foreign host or page, or too large; None where it may go on."""
+    host, origin = headers.get("host", ""), headers.get("origin")
+    if hosts is not None and re.sub(r":\d+$", "", host) not in hosts:
+        return 421, "unknown host"
+    if origin is not None and origin.partition("://")[2] != host:
+        return 403, "another site's page"
+    length = headers.get("content-length", "0" if method in ("GET", "HEAD") else "")
+    if "transfer-encoding" in headers or not length.isdecimal():
+        return 411, "needs Content-Length"
+    return (413, "too large") if int(length) > MAX_BODY else None
+
+
+def about_study(args: Args, clips: list[Clip]) -> dict:
+    """What the page tells a participant."""
+    rules = args.videos / "rules.txt"
+    return {
+        "consent": None if args.consent is None else read_text(args.consent, "--consent"),
+        "contact": args.contact,
+        "rules": read_text(rules, "--videos") if rules.is_file() else "",
+        "practice": (args.videos / "practice.mp4").is_file(),
+        "clips": len({clip.agent for clip in clips}) * args.clips_per_agent,
+        "seconds": round(describe_clip(clips[0].path.read_bytes())[0]),
+    }
+
+
 def make_app(args: Args, clips: list[Clip]):
     """The web application: a page, three requests of it, and the clips."""
     from fastapi import FastAPI, HTTPException, Request, Response
@@ -747,15 +773,8 @@ def make_app(args: Args, clips: list[Clip]):
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     page, hosts = Path(__file__).with_suffix(".html").read_text(), allowed_hosts(args.host)
     paths = {clip.sha256: clip.path for clip in clips}
-    rules, practice = args.videos / "rules.txt", args.videos / "practice.mp4"
-    about = {
-        "consent": None if args.consent is None else read_text(args.consent, "--consent"),
-        "contact": args.contact,
-        "rules": read_text(rules, "--videos") if rules.is_file() else "",
-        "practice": practice.is_file(),
-        "clips": len({clip.agent for clip in clips}) * args.clips_per_agent,
-        "seconds": round(describe_clip(clips[0].path.read_bytes())[0]),
-    }
+    practice = args.videos / "practice.mp4"
+    about = about_study(args, clips)
 
     class Key(BaseModel):
         key: str = Field(pattern="^[0-9a-f]{32}$")
@@ -775,17 +794,8 @@ def make_app(args: Args, clips: list[Clip]):
 
     @app.middleware("http")
     async def guard(request: Request, call_next) -> Response:
-        name = re.sub(r":\d+$", "", request.headers.get("host", ""))
-        if hosts is not None and name not in hosts:
-            return Response("unknown host", 421)
-        origin = request.headers.get("origin")
-        if origin is not None and origin.partition("://")[2] != request.headers.get("host"):
-            return Response("another site's page", 403)
-        length = request.headers.get("content-length", "0" if request.method in ("GET", "HEAD") else "")
-        if "transfer-encoding" in request.headers or not length.isdecimal():
-            return Response("needs Content-Length", 411)
-        if int(length) > MAX_BODY:
-            return Response("too large", 413)
+        if (refusal := refused(request.method, request.headers, hosts)) is not None:
+            return Response(refusal[1], refusal[0])
         response = await call_next(request)
         response.headers["X-Content-Type-Options"] = "nosniff"
         response.headers["Referrer-Policy"] = "no-referrer"
@@ -794,7 +804,8 @@ def make_app(args: Args, clips: list[Clip]):
     @app.get("/")
     def show_page() -> Response:
         nonce = secrets.token_urlsafe(16)
-        policy = "default-src 'none'; base-uri 'none'; frame-ancestors 'none'; connect-src 'self'; media-src 'self'; form-action 'none'; "
+        policy = "default-src 'none'; base-uri 'none'; frame-ancestors 'none'; form-action 'none'; "
+        policy += "connect-src 'self'; media-src 'self'; "
         policy += f"script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'"
         content = page.replace("{{nonce}}", nonce).replace("{{about}}", json.dumps(about).replace("<", "\\u003c"))
         headers = {"Content-Security-Policy": policy, "Cache-Control": "no-store"}
