@@ -1,5 +1,6 @@
 """benchmark/sweep.py with runs that last milliseconds; on a real Slurm in test_slurm.py."""
 
+import contextlib
 import fcntl
 import importlib
 import json
@@ -218,8 +219,11 @@ def kill_at_random(flags: list, folder: Path, most: int, longest: float) -> int:
             continue
         children = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
         if kills < most:
-            os.kill(process.pid if rng.random() < 0.3 or not children else int(rng.choice(children)), signal.SIGKILL)
-            kills += 1
+            with contextlib.suppress(ProcessLookupError):  # it ended by itself just now
+                os.kill(
+                    process.pid if rng.random() < 0.3 or not children else int(rng.choice(children)), signal.SIGKILL
+                )
+                kills += 1
     process.communicate()
     return kills
 
