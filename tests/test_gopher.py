@@ -2,10 +2,12 @@
 
 import csv
 import functools
+import importlib
 import json
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -364,6 +366,41 @@ def student(tmp_path_factory, pixel_teacher) -> Path:
     flags = ["--teacher", pixel_teacher, "--run-dir", "run", "--save-model", "--save-demos", 1, "--bf16"]
     run(*SMALL_DISTILL, *flags, cwd=folder, script=DISTILL)
     return folder / "run"
+
+
+def test_the_report_takes_whatever_is_done(pixel_teacher, student, tmp_path):
+    """Published rows beside measured ones, differences seed by seed, and no claim of what is not there."""
+    for name, folder in (("teacher_seed1", pixel_teacher), ("alpha0.8_seed1", student)):
+        shutil.copytree(folder, tmp_path / "runs" / name)
+    flags = [*SMALL_DISTILL, "--teacher", pixel_teacher, "--bf16", "--epochs", 1, "--alpha", 0]
+    run(*flags, "--run-dir", tmp_path / "runs" / "alpha0.0_seed1", cwd=tmp_path, script=DISTILL)
+    script = ROOT / "benchmark" / "gopher_report.py"
+    run("--runs", "runs", "--out", "out", "--human-episodes", 1, cwd=tmp_path, script=script)
+    text = (tmp_path / "out" / "table.md").read_text()
+    hybrid, clone = (
+        json.loads((tmp_path / "runs" / f"alpha{alpha}_seed1" / "result.json").read_text())["evaluation"]["sampled"]
+        for alpha in ("0.8", "0.0")
+    )
+    assert "| hybrid, α = 0.8 | **published** | 1 | 132 | 0 | 26.05 | 24.31 | |" in text
+    mean = hybrid["rewards_per_life"]["mean"]
+    assert f"| hybrid, α = 0.8 | sampled | 1 | {hybrid['rewards_per_life']['max']:.0f} |" in text
+    assert f"| {mean:.2f} |" in text and f"| {hybrid['mean']:.0f} |" in text
+    assert f"| hybrid, α = 0.8, less BC, α = 0 | +2.1 | {mean - clone['rewards_per_life']['mean']:+.1f} |" in text
+    assert "| α = 1, less α = 0.7 |  |  |  |  |  |" in text and "nan" not in text
+    for name in ("fig_2_6.png", "teacher.png", "runs.csv"):
+        assert (tmp_path / "out" / name).stat().st_size > 100
+
+
+def test_the_teacher_s_curve_is_the_moving_mean_of_its_episodes(tmp_path):
+    sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
+    report = importlib.import_module("gopher_report")
+    (tmp_path / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n")
+    assert report.teacher_curve(tmp_path) == []
+    rows = "".join(f"{100 * (i + 1)},{i % 2 * 10},5\n" for i in range(101))
+    (tmp_path / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + rows)
+    curve = report.teacher_curve(tmp_path)
+    assert len(curve) == 200 and (curve[0]["frames"], curve[-1]["frames"]) == (5_000, 10_100)
+    assert {row["mean_of_50_episodes"] for row in curve} == {5.0}
 
 
 def memory_after(actions: list[int]) -> np.ndarray:

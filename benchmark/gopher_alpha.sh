@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# Gopher: a teacher from 10,010,000 frames of pixels, and students of it and of the synthetic human over α, and over T at
+# three α; the runs behind benchmark/results/gopher/. Can be sent again after every stop. The teacher takes about 3 hours
+# of a core and 8 GB of disk, a student about 10 minutes and 3 GB of memory.
+#   benchmark/gopher_alpha.sh
+#   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
+set -euo pipefail
+cd "$(dirname "$0")/.."
+SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/gopher}
+OUT=${OUT:-benchmark/results/gopher}
+ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
+TEMPERATURES=${TEMPERATURES-0.1 0 1} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0 0.5}
+mkdir -p "$RUNS"
+"$PYTHON" cleanrl_thesis/dqn_gopher.py --bf16 --save-model --run-dir "$RUNS/teacher_seed1" --resume
+student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
+  echo --seed "$1" --alpha "$2" --run-dir "$RUNS/$3_seed$1" "${@:4}"
+}
+{
+  for alpha in $ALPHAS; do
+    for seed in $SEEDS; do student "$seed" "$alpha" "alpha$alpha"; done
+  done
+  for temperature in $TEMPERATURES; do
+    for alpha in $OTHER_ALPHAS; do
+      for seed in $SEEDS; do student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"; done
+    done
+  done
+} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --teacher "$RUNS/teacher_seed1" \
+  --bf16 --eval-episodes 50 --save-model --resume
+"$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT"

@@ -1,0 +1,255 @@
+"""Gopher's runs -> Table 2.2, Fig. 2.6, the teacher's learning curve, and whether the thesis' claims hold.
+
+    python benchmark/gopher_report.py        # runs/gopher -> benchmark/results/gopher
+
+Takes whatever part of the runs of `benchmark/gopher_alpha.sh` is done. Scores are the number of rewards in each life, the unit
+in which Table 2.2 seems to count (see the README), and in `runs.csv` also the points of a game. Intervals are 95% t-intervals
+of the seeds' means; a seed has its own human and student, but all students have the same DQN.
+"""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from apple_report import (
+    ACTS,
+    alpha_curve,
+    cell,
+    interval,
+    mean_score,
+    paired_difference,
+    representative_alpha,
+    select,
+    temperatures,
+    with_interval,
+)
+from common import ROOT, commit, commit_of, finished_runs, published_table, write_csv
+from gopher_players import Args as PlayersArgs
+from gopher_players import load_method, measure
+from matplotlib.figure import Figure
+
+LIVES, GAMES = "rewards of a life", "points of a game"
+STUDENTS = {"hybrid, α = 0.8": "alpha0.8", "BC, α = 0": "alpha0.0", "distilled DQN, α = 1": "alpha1.0"}
+WINDOW = 50  # episodes of the teacher's moving mean
+
+
+@dataclass
+class Args:
+    runs: Path = Path("runs/gopher")
+    """folder of the runs' folders"""
+    human_episodes: int = 100
+    """games of the synthetic human for each seed"""
+    out: Path = ROOT / "benchmark" / "results" / "gopher"
+    """folder for tables and figures"""
+
+
+def read_runs(folder: Path) -> list[dict]:
+    """A row for every finished run, way to act and unit: what it was and what it scored."""
+    rows = []
+    for run, result in finished_runs(folder):
+        args, is_student = json.loads((run / "args.json").read_text()), "sampled" in result["evaluation"]
+        evaluations = result["evaluation"] if is_student else {"greedy": result["evaluation"]}
+        for mode, numbers in evaluations.items():
+            for unit, scores in ((LIVES, numbers["rewards_per_life"]), (GAMES, numbers)):
+                row = {"kind": re.sub(r"_seed\d+$", "", run.name), "seed": result["seed"]}
+                row |= {"alpha": args.get("alpha", ""), "temperature": args.get("temperature", "")}
+                row |= {"mode": mode, "unit": unit, "scores": scores["episodes"]}
+                row |= {name: round(scores[name], 3) for name in ("mean", "std", "min", "max")}
+                row |= {"kept_epoch": result["test"]["epoch"] if is_student else ""}
+                row |= {"agrees_with_dqn": round(result.get("test", {}).get("accuracy_rl") or np.nan, 4)}
+                row |= {"agrees_with_human": round(result.get("test", {}).get("accuracy_human", np.nan), 4)}
+                row |= {"steps": result["global_step"], "training_seconds": round(result["training_seconds"])}
+                rows.append(row | {"script_sha256": result["script_sha256"][:12]})
+    return rows
+
+
+def human_rows(seeds: list[int], episodes: int) -> list[dict]:
+    """The synthetic human's games for each seed, in the same units."""
+    method = load_method("distill_hybrid")
+    rows = []
+    for seed in seeds:
+        measured = measure(method, "human", method.SyntheticGopherHuman, PlayersArgs(episodes=episodes, seed=seed))
+        rows += [{**row, "seed": seed} for row in measured if row["unit"] in (LIVES, GAMES)]
+    return rows
+
+
+def score_cells(group: list[dict]) -> str:
+    """Number of seeds, means of the greatest and the least score, mean and spread."""
+    most, least, means, spreads = ([row[name] for row in group] for name in ("max", "min", "mean", "std"))
+    return (
+        f"{len(group)} | {np.mean(most):.0f} | {np.mean(least):.1f} | {with_interval(means)} | {with_interval(spreads)}"
+    )
+
+
+def table_2_2(rows: list[dict], human: list[dict]) -> str:
+    """Table 2.2, published beside measured, and the points of a game."""
+    published = published_table("table_2_2.csv")
+    lines = ["| agent | | seeds | max | min | avg | std | points of a game |", "|" + "---|" * 8]
+    measured = {"human": [("synthetic", human)], "DQN": [("greedy", select(rows, "teacher", "greedy"))]}
+    measured |= {name: [(mode, select(rows, kind, mode)) for mode in ACTS] for name, kind in STUDENTS.items()}
+    for agent, groups in measured.items():
+        if agent in published:
+            numbers = " | ".join(published[agent][name] for name in ("max", "min", "avg", "std"))
+            lines.append(f"| {agent} | **published** | 1 | {numbers} | |")
+        for acts, group in groups:
+            in_units = {unit: [row for row in group if row["unit"] == unit] for unit in (LIVES, GAMES)}
+            if group:
+                points = with_interval([row["mean"] for row in in_units[GAMES]], 0)
+                lines.append(f"| {agent} | {ACTS.get(acts, acts)} | {score_cells(in_units[LIVES])} | {points} |")
+    return "\n".join(lines) + "\n"
+
+
+def by_seed(rows: list[dict]) -> dict[int, float]:
+    return {row["seed"]: row["mean"] for row in rows if row["unit"] == LIVES}
+
+
+def claims_table(rows: list[dict], human: list[dict]) -> str:
+    """The order, the plateau below α = 0.6 and the rise from 0.7 of Fig. 2.6, as differences seed by seed."""
+    published = {name: float(row["avg"]) for name, row in published_table("table_2_2.csv").items()}
+    lines = [f"| rewards of a life | published | {' | '.join(ACTS.values())} |", "|---|---|" + "---|" * len(ACTS)]
+    dqn = by_seed(select(rows, "teacher", "greedy"))
+    students = sorted({row["seed"] for row in rows if row["kind"] in STUDENTS.values()})
+    teachers = {seed: score for score in dqn.values() for seed in students}
+    pairs = (
+        ("DQN", "hybrid, α = 0.8"),
+        ("hybrid, α = 0.8", "human"),
+        ("hybrid, α = 0.8", "BC, α = 0"),
+        ("distilled DQN, α = 1", "hybrid, α = 0.8"),
+        ("α = 0.6", "α = 0"),
+        ("α = 1", "α = 0.7"),
+    )
+    for first, second in pairs:
+        known = first in published and second in published
+        cells = [f"{published[first] - published[second]:+.1f}" if known else ""]
+        for mode in ACTS:
+            curve = alpha_curve([row for row in rows if row["unit"] == LIVES], mode)
+            scores = {name: curve.get(float(kind[5:]), {}) for name, kind in STUDENTS.items()}
+            scores |= {f"α = {alpha:g}": values for alpha, values in curve.items()}
+            scores |= {"DQN": teachers, "human": by_seed(human)}
+            have = scores.get(first) and scores.get(second)
+            cells.append(paired_difference(scores[first], scores[second]) if have else "")
+        lines.append(f"| {first}, less {second} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def swept_temperatures(rows: list[dict]) -> list[float]:
+    """Of the students that are there; the default where there are none but clones, which do not depend on it."""
+    return temperatures(rows) or [0.01]
+
+
+def alpha_table(rows: list[dict], mode: str, human: float) -> str:
+    """Fig. 2.6 in numbers: score for each α and temperature, and the α that the thesis' rule picks."""
+    columns = {temperature: alpha_curve(rows, mode, temperature) for temperature in swept_temperatures(rows)}
+    alphas = sorted({alpha for curve in columns.values() for alpha in curve})
+    most = max(len(scores) for curve in columns.values() for scores in curve.values())
+    lines = [f"| α, {ACTS[mode]} | " + " | ".join(f"T = {temperature}" for temperature in columns) + " |"]
+    lines.append("|---|" + "---|" * len(columns))
+    for alpha in alphas:
+        lines.append(f"| {alpha} | {' | '.join(cell(curve.get(alpha, {}), most) for curve in columns.values())} |")
+    picked = [representative_alpha(curve, human) for curve in columns.values()]
+    lines.append(f"| rule picks | {' | '.join('none' if alpha is None else str(alpha) for alpha in picked)} |")
+    return "\n".join(lines) + "\n"
+
+
+def agreement_table(rows: list[dict]) -> str:
+    """How often the kept network agrees with its teachers on frames that it did not learn from."""
+    lines = ["| runs | seeds | kept epochs | agrees with DQN | with human |", "|---|---|---|---|---|"]
+    kept = [row for row in rows if row["mode"] == "sampled" and row["unit"] == LIVES]
+    for kind in sorted({row["kind"] for row in kept}):
+        group = select(kept, kind, "sampled")
+        epochs = ", ".join(str(row["kept_epoch"]) for row in group)
+        known = {name: [row[name] for row in group] for name in ("agrees_with_dqn", "agrees_with_human")}
+        cells = ["" if np.isnan(values).any() else with_interval(values, 3) for values in known.values()]
+        lines.append(f"| {kind} | {len(group)} | {epochs} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def figure_2_6(rows: list[dict], human: float) -> Figure:
+    """Score over α, a panel for each way to act and kept network, a line for each T."""
+    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    published = {name: float(row["avg"]) for name, row in published_table("table_2_2.csv").items()}
+    stars = {0.0: published["BC, α = 0"], 0.8: published["hybrid, α = 0.8"]}
+    teacher = list(by_seed(select(rows, "teacher", "greedy")).values())
+    grid = figure.subplots(2, 2, sharex=True, sharey=True)
+    for axes, mode in zip(grid.flat, ACTS):
+        for i, temperature in enumerate(swept_temperatures(rows)):
+            curve = alpha_curve(rows, mode, temperature)
+            means, halves = np.array([interval(list(scores.values())) for scores in curve.values()]).T
+            style = {"color": f"C{i}", "linestyle": "-" if len(curve) > 4 else ":"}
+            axes.plot(list(curve), means, "o", markersize=3, label=f"T = {temperature}", **style)
+            low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
+            axes.fill_between(list(curve), low, high, color=f"C{i}", alpha=0.15, linewidth=0)
+        if teacher:
+            axes.axhline(np.mean(teacher), color="black", linestyle="--", linewidth=1, label="DQN")
+        axes.axhline(human, color="black", linestyle=":", linewidth=1, label="synthetic human")
+        axes.plot(list(stars), list(stars.values()), "k*", markersize=8, label="published (Table 2.2)")
+        axes.set(title=ACTS[mode], ylim=(0, None))
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in grid[1]:
+        axes.set_xlabel("α, weight of the DQN")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("rewards of a life")
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), fontsize="small", loc="outside right center")
+    seeds = len({row["seed"] for row in rows if row["kind"] != "teacher"})
+    figure.suptitle(f"Fig. 2.6: mean score over α; bands are 95% intervals of {seeds} seed{'s' * (seeds > 1)}")
+    return figure
+
+
+def teacher_curve(run: Path) -> list[dict]:
+    """The moving mean of the teacher's episodes in training, at 200 points; empty where none has ended."""
+    lines = (run / "episodes.csv").read_text().splitlines()[1:]
+    if not lines:
+        return []
+    ends, returns, _ = np.array([line.split(",") for line in lines], np.float64).T
+    width = min(WINDOW, len(returns))
+    means = np.convolve(returns, np.ones(width) / width, "valid")
+    at = np.linspace(ends[width - 1], ends[-1], 200)
+    values = np.interp(at, ends[width - 1 :], means)
+    return [{"frames": int(x), f"mean_of_{width}_episodes": round(float(y), 1)} for x, y in zip(at, values)]
+
+
+def provenance(rows: list[dict]) -> str:
+    """What the results rest on."""
+    runs = {(row["kind"], row["seed"]): row for row in rows}
+    hours = sum(row["training_seconds"] for row in runs.values()) / 3600
+    scripts = {"dqn_gopher": "teacher", "distill_hybrid": "alpha"}
+    digests = {s: {row["script_sha256"] for row in rows if part in row["kind"]} for s, part in scripts.items()}
+    made_at = [f"{s}.py at {', '.join(sorted(commit_of(s, d) for d in digests[s]))}" for s in scripts if digests[s]]
+    return (
+        f"`benchmark/gopher_alpha.sh`, commits: {'; '.join(made_at)}; this report at {commit()}. {len(runs)} runs, "
+        f"{hours:.1f} core-hours of training; each ± is a 95% t-interval over seeds. A student is of the epoch with the best "
+        "test accuracy where no other is named; greedy players have 1% of random actions.\n\n"
+    )
+
+
+def main(args: Args) -> None:
+    rows = read_runs(args.runs)
+    if not rows:
+        raise SystemExit(f"--runs {args.runs}: holds no finished run")
+    lives = [row for row in rows if row["unit"] == LIVES]
+    human = human_rows(sorted({row["seed"] for row in rows}), args.human_episodes)
+    human_score = mean_score(by_seed(human))
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_csv(args.out / "runs.csv", rows)
+    sections = {"Table 2.2": table_2_2(rows, human)}
+    if any(row["kind"] != "teacher" for row in rows):
+        sections["The thesis' claims"] = claims_table(rows, human)
+        sections["Fig. 2.6"] = "\n".join(alpha_table(lives, mode, human_score) for mode in ACTS)
+        sections["Which network is kept"] = agreement_table(rows)
+        figure_2_6(lives, human_score).savefig(args.out / "fig_2_6.png", dpi=130)
+    for run, _ in finished_runs(args.runs):
+        if run.name.startswith("teacher"):
+            (args.out / "teacher.png").write_bytes((run / "learning_curve.png").read_bytes())
+            curve = teacher_curve(run)
+            if curve:
+                write_csv(args.out / "teacher.csv", curve)
+    text = provenance(rows) + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
+    (args.out / "table.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
