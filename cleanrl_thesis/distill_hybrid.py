@@ -878,6 +878,11 @@ def numpy_greedy(agent: QNetwork):
     return greedy
 
 
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bfloat16: a CPU without such instructions takes several times as long as in float32."""
+    return device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 class AtariQNetwork(nn.Module):
     """Q(s, ·) of each action: convolutions (for the memory's bytes two layers), a hidden layer, one linear head.
 
@@ -1655,7 +1660,9 @@ def main(args: Args) -> int:
     make_env(args.env_id).close()
     if args.capture_video:
         check_video(args.env_id)
-    teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id, args.bf16)
+    device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
+    bf16 = args.bf16 and has_bf16(device)
+    teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id, bf16)
     human_episodes = read_human(args)
     torch.set_num_threads(args.num_threads)
     human = join_frames(human_episodes, args.demo_frames)
@@ -1684,12 +1691,13 @@ def main(args: Args) -> int:
     torch.backends.cudnn.deterministic = args.torch_deterministic
     if args.cuda and not torch.cuda.is_available():
         print("--cuda: no GPU here, goes on with the CPU", file=sys.stderr)
-    device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
+    if args.bf16 and not bf16:
+        print("--bf16: no bfloat16 instructions here, goes on in float32", file=sys.stderr)
     stop = StopSignal()
 
     training, test = (data.at(rows).to(device) for rows in (~is_test, is_test))
     shapes = tuple(data.he_obs.shape[1:]), data.rl_labels.shape[1], args.hidden_size
-    student = Student(*shapes, args.bf16).to(device)
+    student = Student(*shapes, bf16).to(device)
     update = Update(student, args, training.at(torch.arange(min(args.batch_size, len(training.he_obs)))))
     arithmetic = f"{'compiled' if update.is_compiled else 'plain'} on {device.type}"
     best = {"vector": update.vector.clone(), "accuracy": -1.0, "epoch": 0, **dict.fromkeys(("rl", "human"), 0.0)}

@@ -346,6 +346,11 @@ def game_options(args: Args) -> dict:
 # ---------------------------------------------------------------------------------------------------------------------
 # Network
 # ---------------------------------------------------------------------------------------------------------------------
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bfloat16: a CPU without such instructions takes several times as long as in float32."""
+    return device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 class AtariQNetwork(nn.Module):
     """Q(s, ·) of each action: convolutions (for the memory's bytes two layers), a hidden layer, one linear head.
 
@@ -1050,7 +1055,10 @@ def main(args: Args) -> int:
 
     obs_shape, num_actions = games[0].observation_space.shape, int(games[0].action_space.n)
     shapes = obs_shape, num_actions, args.hidden_size
-    learner = Learner(lambda: AtariQNetwork(*shapes, args.dueling, args.bf16), args, device)
+    bf16 = args.bf16 and has_bf16(device)
+    if args.bf16 and not bf16:
+        print("--bf16: no bfloat16 instructions here, goes on in float32", file=sys.stderr)
+    learner = Learner(lambda: AtariQNetwork(*shapes, args.dueling, bf16), args, device)
     players = Players(games, args)
     between = max(args.checkpoint_interval // frames_per_step, 1) + 1  # rows of two checkpoints, at most
     spare = 2 * min(between, args.num_iterations)

@@ -779,6 +779,11 @@ class ConvDecoder(nn.Module):
         return self.layers(pixels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)  # a permuted picture is channels_last
 
 
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bfloat16: a CPU without such instructions takes several times as long as in float32."""
+    return device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 def as_computed(x: torch.Tensor) -> torch.Tensor:
     """x in the type that matrix products are computed in: cast once, and not before each of them."""
     device = x.device.type
@@ -1067,6 +1072,7 @@ class Learner:
 
     def __init__(self, args: Args, model: nn.Module, device: torch.device):
         self.args, self.device, self.updates = args, device, 0
+        self.bf16 = args.bf16 and has_bf16(device)
         self.model = model.to(device)
         self.behaviour = Behaviour(args, model).to(device)
         self.modules = {"model": self.model, **self.behaviour.parts()}
@@ -1095,7 +1101,7 @@ class Learner:
 
     def arithmetic(self) -> contextlib.AbstractContextManager:
         """bfloat16 for matrix products with `--bf16`."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.args.bf16)
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
     def update(self, data: Chunks) -> dict[str, torch.Tensor]:
         """One gradient step on everything (Eq. 3.3.11); returns what to log."""
@@ -1724,6 +1730,8 @@ def main(args: Args) -> int:
     model = WorldModel(args, int(ROOM_ACTIONS.n))
     set_frame_statistics(model, args)
     learner = Learner(args, model, device)
+    if args.bf16 and not learner.bf16:
+        print("--bf16: no bfloat16 instructions here, goes on in float32", file=sys.stderr)
     collector = Collector(
         args, Replay(run_dir / "replay.dat", args, checkpoint is not None), Player(learner, args.num_envs)
     )
@@ -1738,7 +1746,9 @@ def main(args: Args) -> int:
         torch.set_rng_state(checkpoint["torch_rng"])
     else:
         collector.reset()
-    arithmetic = f"{'compiled' if is_compiled else 'plain'}, {'bfloat16' if args.bf16 else 'float32'} on {device.type}"
+    arithmetic = (
+        f"{'compiled' if is_compiled else 'plain'}, {'bfloat16' if learner.bf16 else 'float32'} on {device.type}"
+    )
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])

@@ -14,6 +14,7 @@ only where a segment begins, w_t with each step. Actor and critic see both, and 
 | Eq. 3.3.9 | − log π · V − η H | the λ-return less the slow critic in the place of V |
 | end of an episode | not in the model | a discount head, as in the baseline |
 | v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all (`--classes 1`: normal) |
+| Z and W | half of S each | `xs` and `s`: 4 and 20 of 24 variables, for y has to show each frame between two reads; 12 and 12 need more updates |
 | boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; whether segments last is not measured yet |
 | the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.7); no read or copy is forced within an episode |
 | faithful model | | `--classes 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0 --kl-m-scale 1` |
@@ -234,8 +235,8 @@ class Args:
 
 
 SIZES = {  # features are as many as the baseline's
-    "xs": {"encoder": "tiles", "frame_side": 22, "depth": 16, "deter_z": 128, "stoch_z": 12, "deter_w": 128}
-    | {"stoch_w": 12, "classes": 16}
+    "xs": {"encoder": "tiles", "frame_side": 22, "depth": 16, "deter_z": 128, "stoch_z": 4, "deter_w": 128}
+    | {"stoch_w": 20, "classes": 16}
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
     | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 128, "gamma": 0.99, "image_scale": 0.25}
     | {"kl_z_scale": 1.0, "kl_w_scale": 1.0, "kl_warmup": 1_000, "entropy_scale": 0.3}
@@ -250,7 +251,7 @@ SIZES = {  # features are as many as the baseline's
     | {"model_learning_rate": 2e-4, "actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4}
     | {"adam_eps": 1e-5, "ent_coef": 1e-3},
 }
-SIZES["s"] = SIZES["xs"] | {"deter_z": 256, "stoch_z": 24, "deter_w": 256, "stoch_w": 24, "hidden_size": 256}
+SIZES["s"] = SIZES["xs"] | {"deter_z": 256, "stoch_z": 8, "deter_w": 256, "stoch_w": 40, "hidden_size": 256}
 SIZES["s"] |= {"head_size": 256, "depth": 24}
 SIZES["m"] = SIZES["thesis"] | {"depth": 16, "deter_z": 306, "stoch_z": 306, "deter_w": 306, "stoch_w": 306}
 SIZES["m"] |= {"hidden_size": 200, "head_size": 200, "adam_eps": 1e-8}
@@ -805,6 +806,11 @@ class ConvDecoder(nn.Module):
         return self.layers(pixels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)  # a permuted picture is channels_last
 
 
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bfloat16: a CPU without such instructions takes several times as long as in float32."""
+    return device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 def as_computed(x: torch.Tensor) -> torch.Tensor:
     """x in the type that matrix products are computed in: cast once, and not before each of them."""
     device = x.device.type
@@ -1142,9 +1148,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     kl_w = balanced(kl_divergence, made.q_w, p_w, args.kl_balance)
     decides = 1 - made.forced[1:]  # q(m_t) pairs with p(m_t) where step t + 1 was free to read or to copy
     kl_m = decides * balanced(kl_bernoulli, made.q_m[:-1], made.p_m, args.kl_balance)
-    settled = decides * (
-        1 - data.first[:-1]
-    )  # a read right after the first ends no segment: at the first c knows nothing
+    settled = decides * (1 - data.first[:-1])  # a read after the first ends no segment: at the first c knows nothing
     expected = (torch.sigmoid(made.q_m[:-1]) * settled).sum() / settled.sum().clamp(min=1)
     features = as_computed(flat.features())
     target = data.rewards.tanh() if args.tanh_reward else data.rewards
@@ -1167,8 +1171,8 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     follows = inside[1:] * (1 - data.first[:-1])
     later = (read[1:] * follows).sum()
     parts |= {"read_rate": later / follows.sum().clamp(min=1), "segment_length": follows.sum() / later.clamp(min=1)}
-    agreement = ((made.p_m > 0) == (made.q_m[:-1] > 0)).float() * settled
-    parts |= {"agreement": agreement.sum() / settled.sum().clamp(min=1)}
+    spread = ((torch.sigmoid(made.q_m[:-1]) - expected).square() * settled).sum() / settled.sum().clamp(min=1)
+    parts |= {"read_spread": spread.sqrt()}  # 0: q(m) is the same everywhere
     return loss, made.belief, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
 
@@ -1272,6 +1276,7 @@ class Learner:
 
     def __init__(self, args: Args, model: nn.Module, device: torch.device):
         self.args, self.device, self.updates = args, device, 0
+        self.bf16 = args.bf16 and has_bf16(device)
         self.model = model.to(device)
         self.behaviour = Behaviour(args, model).to(device)
         self.modules = {"model": self.model, **self.behaviour.parts()}
@@ -1300,7 +1305,7 @@ class Learner:
 
     def arithmetic(self) -> contextlib.AbstractContextManager:
         """bfloat16 for matrix products with `--bf16`."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.args.bf16)
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
     def update(self, data: Chunks) -> dict[str, torch.Tensor]:
         """One gradient step on everything (Eq. 3.3.11); returns what to log."""
@@ -1929,6 +1934,8 @@ def main(args: Args) -> int:
     model = HWM(args, int(ROOM_ACTIONS.n))
     set_frame_statistics(model, args)
     learner = Learner(args, model, device)
+    if args.bf16 and not learner.bf16:
+        print("--bf16: no bfloat16 instructions here, goes on in float32", file=sys.stderr)
     collector = Collector(
         args, Replay(run_dir / "replay.dat", args, checkpoint is not None), Player(learner, args.num_envs)
     )
@@ -1943,7 +1950,9 @@ def main(args: Args) -> int:
         torch.set_rng_state(checkpoint["torch_rng"])
     else:
         collector.reset()
-    arithmetic = f"{'compiled' if is_compiled else 'plain'}, {'bfloat16' if args.bf16 else 'float32'} on {device.type}"
+    arithmetic = (
+        f"{'compiled' if is_compiled else 'plain'}, {'bfloat16' if learner.bf16 else 'float32'} on {device.type}"
+    )
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])

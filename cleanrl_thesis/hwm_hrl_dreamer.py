@@ -14,7 +14,7 @@ same bytes.
 | high-level return | V_λ^{H,τ} over segments | on the clock of the steps: rewards within a segment are summed and discounted, λ counts at its end; a segment that the dream does not finish ends with V^L(w, z, e) |
 | Eq. 3.3.16, 3.3.17 | summed over the decisions | the mean over them, weighed by how likely the dream comes to each |
 | low-level return | V_λ^{L,h} | goes on over the boundaries |
-| decisions of π^H | where a segment begins | there, and at each dream's start, most of which lie within a segment |
+| a dream that starts within a segment | not said | draws a skill there too, from which π^H and V^H do not learn |
 | boundaries, acting, departures of the model | | as in `hwm_dreamer.py` |
 
 Nothing makes π^L use its skill: `losses/skill_information` is I(e; a | w, z) in nats.
@@ -236,8 +236,8 @@ class Args:
 
 
 SIZES = {  # features are as many as the baseline's
-    "xs": {"encoder": "tiles", "frame_side": 22, "depth": 16, "deter_z": 128, "stoch_z": 12, "deter_w": 128}
-    | {"stoch_w": 12, "classes": 16}
+    "xs": {"encoder": "tiles", "frame_side": 22, "depth": 16, "deter_z": 128, "stoch_z": 4, "deter_w": 128}
+    | {"stoch_w": 20, "classes": 16}
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
     | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 128, "gamma": 0.99, "image_scale": 0.25}
     | {"kl_z_scale": 1.0, "kl_w_scale": 1.0, "kl_warmup": 1_000, "entropy_scale": 0.3}
@@ -252,7 +252,7 @@ SIZES = {  # features are as many as the baseline's
     | {"model_learning_rate": 2e-4, "actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4}
     | {"adam_eps": 1e-5, "ent_coef": 1e-3},
 }
-SIZES["s"] = SIZES["xs"] | {"deter_z": 256, "stoch_z": 24, "deter_w": 256, "stoch_w": 24, "hidden_size": 256}
+SIZES["s"] = SIZES["xs"] | {"deter_z": 256, "stoch_z": 8, "deter_w": 256, "stoch_w": 40, "hidden_size": 256}
 SIZES["s"] |= {"head_size": 256, "depth": 24}
 SIZES["m"] = SIZES["thesis"] | {"depth": 16, "deter_z": 306, "stoch_z": 306, "deter_w": 306, "stoch_w": 306}
 SIZES["m"] |= {"hidden_size": 200, "head_size": 200, "adam_eps": 1e-8}
@@ -807,6 +807,11 @@ class ConvDecoder(nn.Module):
         return self.layers(pixels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)  # a permuted picture is channels_last
 
 
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bfloat16: a CPU without such instructions takes several times as long as in float32."""
+    return device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 def as_computed(x: torch.Tensor) -> torch.Tensor:
     """x in the type that matrix products are computed in: cast once, and not before each of them."""
     device = x.device.type
@@ -1144,9 +1149,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     kl_w = balanced(kl_divergence, made.q_w, p_w, args.kl_balance)
     decides = 1 - made.forced[1:]  # q(m_t) pairs with p(m_t) where step t + 1 was free to read or to copy
     kl_m = decides * balanced(kl_bernoulli, made.q_m[:-1], made.p_m, args.kl_balance)
-    settled = decides * (
-        1 - data.first[:-1]
-    )  # a read right after the first ends no segment: at the first c knows nothing
+    settled = decides * (1 - data.first[:-1])  # a read after the first ends no segment: at the first c knows nothing
     expected = (torch.sigmoid(made.q_m[:-1]) * settled).sum() / settled.sum().clamp(min=1)
     features = as_computed(flat.features())
     target = data.rewards.tanh() if args.tanh_reward else data.rewards
@@ -1169,8 +1172,8 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     follows = inside[1:] * (1 - data.first[:-1])
     later = (read[1:] * follows).sum()
     parts |= {"read_rate": later / follows.sum().clamp(min=1), "segment_length": follows.sum() / later.clamp(min=1)}
-    agreement = ((made.p_m > 0) == (made.q_m[:-1] > 0)).float() * settled
-    parts |= {"agreement": agreement.sum() / settled.sum().clamp(min=1)}
+    spread = ((torch.sigmoid(made.q_m[:-1]) - expected).square() * settled).sum() / settled.sum().clamp(min=1)
+    parts |= {"read_spread": spread.sqrt()}  # 0: q(m) is the same everywhere
     return loss, made.belief, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
 
@@ -1235,7 +1238,7 @@ class Dream(NamedTuple):
     rewards: torch.Tensor  # (H, N), on arriving at state h + 1
     discounts: torch.Tensor  # (H, N): γ times the probability that the episode goes on at state h + 1
     skills: torch.Tensor  # (H + 1, N, K) one-hot
-    decides: torch.Tensor  # (H + 1, N): 1 where the skill was drawn, at the dream's start and where a segment begins
+    decides: torch.Tensor  # (H + 1, N): 1 where a segment begins; a dream's first skill is drawn within one, too
 
 
 @torch.no_grad()
@@ -1245,7 +1248,7 @@ def imagine(model: nn.Module, behaviour: Behaviour, state: NamedTuple, horizon: 
     noise, choices = model.noise(horizon, games), uniforms(horizon, games, device=device)
     skill_choices = uniforms(horizon + 1, games, device=device)
     features, actions = [state.features()], []
-    skills, decides = [behaviour.choose(features[0], skill_choices[0])], [torch.ones(games, device=device)]
+    skills, decides = [behaviour.choose(features[0], skill_choices[0])], [(state.age == 0).float().squeeze(1)]
     for h in range(horizon):
         actions.append(one_hot_sample(behaviour.policy(features[-1], skills[-1]), choices[h]))
         state = model.imagine_step(state, actions[-1], noise[h])
@@ -1290,7 +1293,7 @@ def high_return(rewards, discounts, decides, high_values, last_value, gae_lambda
 
 
 def policy_loss(logits, chosen, advantages, weights, ent_coef: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Eq. 3.3.9: a policy's loss, its terms weighed, and its mean entropy; logits and chosen (H, N, A), the others (H, N)."""
+    """Eq. 3.3.9: a policy's loss, its terms weighed, and its mean entropy; logits and chosen (..., A), the others (...)."""
     log_policy = logits.log_softmax(-1)
     entropy = -(log_policy.exp() * log_policy).sum(-1)
     terms = (log_policy * chosen).sum(-1) * advantages + ent_coef * entropy
@@ -1312,19 +1315,18 @@ def behaviour_loss(
         )
         returns = lambda_return(dream.rewards, dream.discounts, values, gae_lambda)
         high_returns = high_return(dream.rewards, dream.discounts, dream.decides, high_values, values[-1], gae_lambda)
-        weights = dream_weights(dream.discounts)
-        high_weights = weights * dream.decides[:-1]
-        number = dream.decides[:-1].sum()
+        weights, decides = dream_weights(dream.discounts), dream.decides[:-1] > 0
+        number = decides.sum().clamp(min=1)
     logits = behaviour.policy(features, skills)
     actor, entropy = policy_loss(logits, dream.actions, returns - values[:-1], weights, ent_coef)  # Eq. 3.3.15
     critic = (weights * 0.5 * (behaviour.value(features, skills) - returns).square()).mean()  # Eq. 3.3.14
-    advantages = high_returns - high_values[:-1]
-    high_logits = behaviour.high_policy(features)
-    high_actor, high_entropy = policy_loss(high_logits, skills, advantages, high_weights, ent_coef)  # Eq. 3.3.17
-    errors = 0.5 * (behaviour.high_value(features) - high_returns).square()
+    at, advantages = features[decides], (high_returns - high_values[:-1])[decides]  # (M, F), (M,)
+    chosen, high_weights = skills[decides], weights[decides]
+    high_actor, high_entropy = policy_loss(behaviour.high_policy(at), chosen, advantages, high_weights, ent_coef)
+    errors = 0.5 * (behaviour.high_value(at) - high_returns[decides]).square()
     high_critic = (high_weights * errors).sum() / number  # Eq. 3.3.16
     losses = {"actor": actor / weights.numel(), "critic": critic}
-    losses |= {"high_actor": high_actor / number, "high_critic": high_critic}
+    losses |= {"high_actor": high_actor / number, "high_critic": high_critic}  # Eq. 3.3.17
     parts = {
         **losses,
         "entropy": entropy,
@@ -1360,6 +1362,7 @@ class Learner:
 
     def __init__(self, args: Args, model: nn.Module, device: torch.device):
         self.args, self.device, self.updates = args, device, 0
+        self.bf16 = args.bf16 and has_bf16(device)
         self.model = model.to(device)
         self.behaviour = Behaviour(args, model).to(device)
         self.modules = {"model": self.model, **self.behaviour.parts()}
@@ -1388,7 +1391,7 @@ class Learner:
 
     def arithmetic(self) -> contextlib.AbstractContextManager:
         """bfloat16 for matrix products with `--bf16`."""
-        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.args.bf16)
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
     def update(self, data: Chunks) -> dict[str, torch.Tensor]:
         """One gradient step on everything (Eq. 3.3.11); returns what to log."""
@@ -2025,6 +2028,8 @@ def main(args: Args) -> int:
     model = HWM(args, int(ROOM_ACTIONS.n))
     set_frame_statistics(model, args)
     learner = Learner(args, model, device)
+    if args.bf16 and not learner.bf16:
+        print("--bf16: no bfloat16 instructions here, goes on in float32", file=sys.stderr)
     collector = Collector(
         args, Replay(run_dir / "replay.dat", args, checkpoint is not None), Player(learner, args.num_envs)
     )
@@ -2039,7 +2044,9 @@ def main(args: Args) -> int:
         torch.set_rng_state(checkpoint["torch_rng"])
     else:
         collector.reset()
-    arithmetic = f"{'compiled' if is_compiled else 'plain'}, {'bfloat16' if args.bf16 else 'float32'} on {device.type}"
+    arithmetic = (
+        f"{'compiled' if is_compiled else 'plain'}, {'bfloat16' if learner.bf16 else 'float32'} on {device.type}"
+    )
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])

@@ -515,6 +515,11 @@ def orthogonal(layer: nn.Module, gain: float) -> nn.Module:
 OBS_SCALE = 64.0  # grey levels; the agent is a few pixels of 70 levels, the goal of 255
 
 
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bfloat16: a CPU without such instructions takes several times as long as in float32."""
+    return device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 class Agent(nn.Module):
     """Policy and value on one trunk: two convolutions, the first over squares of 2 × 2 pixels, and a hidden layer."""
 
@@ -1147,7 +1152,10 @@ def main(args: Args) -> int:
     stop = StopSignal()
 
     collector = Collector(args, device)
-    agent = Agent(args.frame_side, 3, args.channels, args.hidden_size, args.bf16).to(device)
+    bf16 = args.bf16 and has_bf16(device)
+    if args.bf16 and not bf16:
+        print("--bf16: no bfloat16 instructions here, goes on in float32", file=sys.stderr)
+    agent = Agent(args.frame_side, 3, args.channels, args.hidden_size, bf16).to(device)
     agent.obs_mean.copy_(mean_frame(args))
     update = Update(agent, args)
     iteration, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}
@@ -1159,7 +1167,7 @@ def main(args: Args) -> int:
         collector.load_state_dict(checkpoint["collector"])
         torch.set_rng_state(checkpoint["torch_rng"])
     kind = "compiled" if update.is_compiled else "plain"
-    arithmetic = f"{kind}, {'bfloat16' if args.bf16 else 'float32'} on {device.type}"
+    arithmetic = f"{kind}, {'bfloat16' if bf16 else 'float32'} on {device.type}"
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     global_step = iteration * args.batch_size

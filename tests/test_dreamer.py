@@ -525,7 +525,7 @@ def test_bfloat16_stays_near_float32(tmp_path):
     learner = make_learner(size="m", encoder="cnn", frame_side=64)
     data = make_collector(tmp_path, learner, steps=20).replay.sample(CPU)
     losses = []
-    for learner.args.bf16 in (False, True):
+    for learner.bf16 in (False, True):
         torch.manual_seed(1)
         with learner.arithmetic():
             losses.append(method.world_model_loss(learner.model, data, 1_000)[0].item())
@@ -533,6 +533,13 @@ def test_bfloat16_stays_near_float32(tmp_path):
     wake(learner.behaviour)
     learner.update(data)
     assert all(parameter.grad.abs().sum() > 0 for parameter in learner.behaviour.actor.parameters())
+
+
+def test_without_bfloat16_instructions_float32_is_used(monkeypatch):
+    monkeypatch.setattr(method, "has_bf16", lambda device: False)
+    assert not make_learner(bf16=True).bf16
+    monkeypatch.setattr(method, "has_bf16", lambda device: True)
+    assert make_learner(bf16=True).bf16 and not make_learner(bf16=False).bf16
 
 
 @pytest.mark.slow
@@ -566,6 +573,7 @@ def test_learning_curve_in_bfloat16_stays_within_seeds_of_float32(tmp_path):
             args = make_args(size="m", batch_size=6, chunk_length=8, deter=64, hidden_size=64, bf16=bf16)
             torch.manual_seed(seed)
             learner = method.Learner(args, method.WorldModel(args, 3), CPU)
+            learner.bf16 = bf16  # on a CPU without bfloat16 instructions, too
             folder = tmp_path / f"{bf16}{seed}"
             folder.mkdir()
             replay = make_collector(folder, learner, steps=100).replay
