@@ -17,7 +17,7 @@ import pytest
 import websockets.exceptions
 import websockets.sync.client
 from conftest import ROOT, command
-from playwright.async_api import async_playwright
+from playwright.async_api import Error, async_playwright
 from playwright.sync_api import sync_playwright
 
 from cleanrl_thesis import record_human as record
@@ -174,12 +174,24 @@ class Server:
         self.process, _ = start(STUDY, *self.flags, "--port", self.address.rsplit(":", 1)[1])
 
 
+async def load(go) -> None:
+    """Open or reload a page, again and again while there is no server, as people do."""
+    for _ in range(60):
+        try:
+            await go()
+            return
+        except Error as error:
+            assert "ERR_CONNECTION" in str(error) or "ERR_EMPTY_RESPONSE" in str(error), error
+            await asyncio.sleep(0.5)
+    raise AssertionError("the server does not come back")
+
+
 async def participate(browser, address: str, number: int, judged: list) -> tuple[str, list[tuple[str, str]]]:
     """Take part as people do: reload, click twice, lose the connection. Returns the key and what was answered."""
     rng, given = random.Random(number), []
     context = await browser.new_context()
     page = await context.new_page()
-    await page.goto(address)
+    await load(lambda: page.goto(address))
     await page.check("#agree")
     await page.fill("#age", str(20 + number))
     await page.dblclick("#join")
@@ -191,7 +203,7 @@ async def participate(browser, address: str, number: int, judged: list) -> tuple
             break
         shown = await page.inner_text("#count")
         if rng.random() < 0.2:
-            await page.reload()
+            await load(page.reload)
             await page.wait_for_selector("#trial:visible, #rules:visible", timeout=60_000)
             if await page.is_visible("#rules"):
                 await page.click("#start")
