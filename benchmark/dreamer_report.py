@@ -1,11 +1,13 @@
 """The Dreamers in FourRooms: runs of benchmark/fourrooms.sh -> Fig. 3.5, and the steps to a return of 0.5 and of 0.85.
 
     python benchmark/dreamer_report.py                              # runs/dreamer_xs -> benchmark/results/dreamer/xs
+    python benchmark/dreamer_report.py --known DIR                  # with the runs of an earlier report whose folders are gone
 
 Takes whatever part of the runs there is, as far as the shortest of them has come. A run has come to a return when the mean of
 its last 200 episodes is as high. Intervals are 95% t-intervals over seeds.
 """
 
+import csv
 import json
 import re
 from collections import defaultdict
@@ -34,7 +36,8 @@ CAUSES = {  # the baseline, and what it does without one of the things that it n
     "dreamer_eps": ("Adam's ε is 1e-5", "dreamer_v2", "black"),
 }
 WINDOW = 200  # episodes
-BINS = 200  # points of a curve
+BINS = 200  # points of a drawn curve
+POINTS = 1_000  # points of a curve that is kept for later reports
 LEVELS = (0.5, 0.85)  # learning, solved
 
 
@@ -44,6 +47,8 @@ class Args:
     """folder of the runs' folders"""
     out: Path | None = None
     """folder for figure, table and runs; default: benchmark/results/dreamer/{size}"""
+    known: Path | None = None
+    """folder of an earlier report, whose runs go on in this one"""
 
 
 def moving_mean(returns: np.ndarray) -> np.ndarray:
@@ -78,10 +83,44 @@ def read_run(folder: Path) -> dict:
     return {"row": row, "steps": steps, "means": means}
 
 
-def read_runs(folder: Path) -> list[dict]:
-    """All runs of known agents that have updates. Raises SystemExit where their sizes or tasks differ."""
+def cell(text: str) -> float | int | str:
+    """What a cell of `runs.csv` holds."""
+    if text.isdigit():
+        return int(text)
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def read_known(folder: Path) -> list[dict]:
+    """The runs of an earlier report as `read_runs` gives them. Raises SystemExit where it cannot be read."""
+    try:
+        with open(folder / "runs.csv", newline="") as file:
+            rows = list(csv.DictReader(file))
+        curves = np.load(folder / "curves.npz")
+    except OSError as error:
+        raise SystemExit(f"error: --known {folder}: cannot be read: {error.strerror}") from None
+    words = {"agent", "size", "env_id", "script_sha256"}
+    rows = [{key: text if key in words else cell(text) for key, text in row.items()} for row in rows]
+    return [{"row": row, **dict(zip(("steps", "means"), curves[run_name(row)].astype(float)))} for row in rows]
+
+
+def run_name(row: dict) -> str:
+    return f"{row['agent']}_seed{row['seed']}"
+
+
+def read_runs(folder: Path, known: list[dict] = ()) -> list[dict]:
+    """All runs of known agents that have updates, and those runs of an earlier report that are not among them.
+
+    Raises SystemExit where their sizes or tasks differ.
+    """
     paths = sorted(path.parent for path in folder.glob("*/updates.csv") if path.stat().st_size)
     runs = [read_run(path) for path in paths if re.sub(r"_seed\d+$", "", path.name) in AGENTS | CAUSES]
+    names = {run_name(run["row"]) for run in runs}
+    runs = sorted(
+        runs + [run for run in known if run_name(run["row"]) not in names], key=lambda run: run_name(run["row"])
+    )
     kinds = {(run["row"]["size"], run["row"]["env_id"]) for run in runs}
     if len(kinds) != 1:
         raise SystemExit(f"error: --runs {folder}: " + ("holds runs of several kinds" if kinds else "holds no run"))
@@ -154,6 +193,11 @@ def write_report(runs: list[dict], out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     rows = [run["row"] for run in runs]
     write_csv(out / "runs.csv", rows)
+    curves = {}
+    for run in runs:
+        at = np.unique(np.linspace(0, len(run["steps"]) - 1, POINTS).astype(int))
+        curves[run_name(run["row"])] = np.array([run["steps"][at], run["means"][at]], np.float32)
+    np.savez_compressed(out / "curves.npz", **curves)
     scripts = {((AGENTS | CAUSES)[row["agent"]][1], row["script_sha256"]) for row in rows if row["script_sha256"]}
     made_at = ", ".join(f"{name}.py at {commit_of(name, digest)}" for name, digest in sorted(scripts))
     text = [
@@ -171,6 +215,6 @@ def write_report(runs: list[dict], out: Path) -> None:
 
 if __name__ == "__main__":
     arguments = tyro.cli(Args, description=__doc__.split("\n\n")[0])
-    found = read_runs(arguments.runs)
+    found = read_runs(arguments.runs, read_known(arguments.known) if arguments.known is not None else [])
     size = found[0]["row"]["size"]
     write_report(found, arguments.out or ROOT / "benchmark" / "results" / "dreamer" / size)

@@ -5,6 +5,7 @@
 #   STEPS=300000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 300,000 steps
 #   AGENTS="dreamer_sharp dreamer_slow dreamer_early dreamer_uniform dreamer_eps" SEEDS="1 2" benchmark/fourrooms.sh
 #   SIZE=thesis FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh
+#   KNOWN=benchmark/results/dreamer/xs benchmark/fourrooms.sh    the report goes on from an earlier one whose run folders are gone
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4} AGENTS=${AGENTS:-dreamer hwm hrl hwm_fixed hrl_fixed} SIZE=${SIZE:-xs} ENV_ID=${ENV_ID:-FourRooms11-v0}
@@ -34,4 +35,4 @@ for seed in $SEEDS; do
       --run-dir "$RUNS/${agent}_seed$seed" $own $FLAGS
   done
 done | xargs -P "$WORKERS" -L 1 sh -c '"$0" "$@" --resume' "$PYTHON"
-"$PYTHON" benchmark/dreamer_report.py --runs "$RUNS"
+"$PYTHON" benchmark/dreamer_report.py --runs "$RUNS" ${KNOWN:+--known "$KNOWN"}

@@ -667,6 +667,15 @@ def test_steps_to_a_return_and_curves(tmp_path):
         assert (tmp_path / "out" / name).read_bytes()[1:4] == b"PNG"
     text = (tmp_path / "out" / "table.md").read_text()
     assert text.count("| Dreamer | 2 |") == 2 and text.count("the model's rate is 1e-3 | 1 | not reached") == 1
+    for name in ("dreamer_seed2", "hwm_seed1", "dreamer_slow_seed1"):  # the folders of an earlier machine are gone
+        shutil.rmtree(tmp_path / "runs" / name)
+    later = dreamer_report.read_runs(tmp_path / "runs", dreamer_report.read_known(tmp_path / "out"))
+    assert dreamer_report.table([run["row"] for run in later]) == lines
+    assert all(
+        np.allclose(a["means"], b["means"]) and np.array_equal(a["steps"], b["steps"]) for a, b in zip(runs, later)
+    )
+    with pytest.raises(SystemExit, match="--known .*: cannot be read"):
+        dreamer_report.read_known(tmp_path)
 
 
 def test_moving_mean():
