@@ -1,10 +1,12 @@
 """The world model alone: runs of benchmark/hwm_segment.sh -> one table of the rungs beside segmentations that know nothing.
 
     python benchmark/hwm_report.py        # runs/hwm_segment -> benchmark/results/hwm_segment
+    python benchmark/hwm_report.py --known benchmark/results/hwm_segment   # with the runs of an earlier report, whose folders are gone
 
 Takes whatever part of the runs is done. Means over seeds, with 95% t-intervals where there are several.
 """
 
+import csv
 import json
 import re
 import shutil
@@ -23,6 +25,7 @@ RUNGS = {
     "reset": "(c) w reset where z is read",
     "price": "(d) a price for each read",
     "narrow": "(e) narrow w, reset, budget",
+    "surprise": "(g) and KL_z is a price, c from z alone",
     "no_budget": "(e) without the budget",
     "wander": "(f) trained on a player who wanders",
 }
@@ -47,6 +50,8 @@ class Args:
     """folder of the runs' folders"""
     out: Path = ROOT / "benchmark" / "results" / "hwm_segment"
     """folder for the table, the runs and the figures"""
+    known: Path | None = None
+    """folder of an earlier report, whose runs go on in this one"""
 
 
 def read_runs(folder: Path) -> list[dict]:
@@ -69,6 +74,26 @@ def read_runs(folder: Path) -> list[dict]:
             row |= {f"{what}_from_{level}": value[level] for what, value in made["probes"].items() for level in "zw"}
             rows.append(row | {f"best_floor_{key}": value for key, value in best.items()})
     return rows
+
+
+def read_known(folder: Path, rows: list[dict]) -> list[dict]:
+    """The rows of an earlier report whose runs are not among `rows`. Raises SystemExit where there is none to read."""
+    try:
+        with open(folder / "runs.csv", newline="") as file:
+            known = list(csv.DictReader(file))
+    except OSError as error:
+        raise SystemExit(f"error: --known {folder}: runs.csv cannot be read: {error.strerror}") from None
+    runs, words = {row["run"] for row in rows}, {"rung", "run", "script_sha256", "m"}
+    values = {"True": True, "False": False}
+    return [
+        {
+            key: value if key in words else values.get(value) if value in values else float(value)
+            for key, value in row.items()
+        }
+        | {"seed": int(row["seed"])}
+        for row in known
+        if row["run"] not in runs
+    ]
 
 
 def interval(values: list[float]) -> str:
@@ -130,7 +155,7 @@ def write_report(rows: list[dict], runs: Path, out: Path) -> None:
     (out / "table.md").write_text("\n".join(text) + "\n")
     for rung in RUNGS:
         first = min((row for row in rows if row["rung"] == rung), key=lambda row: row["seed"], default=None)
-        if first:
+        if first and (runs / first["run"]).exists():
             shutil.copy(runs / first["run"] / "figure_3_4.png", out / f"figure_3_4_{rung}.png")
     print("\n".join(text))
 
@@ -138,6 +163,8 @@ def write_report(rows: list[dict], runs: Path, out: Path) -> None:
 if __name__ == "__main__":
     arguments = tyro.cli(Args, description=__doc__.split("\n\n")[0])
     found = read_runs(arguments.runs)
+    if arguments.known is not None:
+        found = read_known(arguments.known, found) + found
     if not found:
         raise SystemExit(f"error: --runs {arguments.runs}: holds no finished run")
     write_report(found, arguments.runs, arguments.out)

@@ -118,7 +118,7 @@ class Args:
     # Algorithm
     attempts: int = 1
     """models trained one after the other, each from weights of its own; that with the greatest J_HWM is kept"""
-    total_updates: int = 4_000
+    total_updates: int = 5_000
     """gradient steps of an attempt"""
     batch_size: int = 16
     """chunks per batch"""
@@ -142,8 +142,8 @@ class Args:
     """added to the standard deviations' outputs at first, so that they start small"""
     image_scale: float | None = None
     """weight of the reconstruction; default: (64 / frame_side)², as if the frames had 64 pixels"""
-    kl_z_scale: float = 0.1
-    """weight of KL[q(z) ‖ p(z)] (Eq. 3.3.5: 1; as the baseline's)"""
+    kl_z_scale: float = 1.0
+    """weight of KL[q(z) ‖ p(z)] (Eq. 3.3.5: 1)"""
     kl_w_scale: float = 0.1
     """weight of KL[q(w) ‖ p(w)] (Eq. 3.3.5: 1; as the baseline's)"""
     kl_m_scale: float = 0.3
@@ -153,7 +153,7 @@ class Args:
     detach_kl_z: bool = True
     """KL_z weighs the reads, and does not price them (VTA); off: Eq. 3.3.7"""
     temperature: float = 0.3
-    """last temperature of the binary Gumbel samples of m; from 1 over 80% of the updates"""
+    """last temperature of the binary Gumbel samples of m; from 1 over `--budget-updates`"""
     boundary_bound: float = 4.0
     """bound on the logits of q(m); 0 for none"""
     read_bias: float = 2.0
@@ -168,8 +168,8 @@ class Args:
     """means of y in ±1 and a fixed noise in q(y), so that it carries few bits"""
     narrow_std: float = 0.4
     """that noise"""
-    c_sees_w: bool = True
-    """c_t is made from w_{t-1} and a_{t-1} too (Eq. 3.3.1), not only from z_{t-1}"""
+    c_sees_w: bool = False
+    """c_t is made from w_{t-1} and a_{t-1} too (Eq. 3.3.1), not only from z_{t-1} (VTA): then z is foretold wherever it is read"""
     decoder_sees_h: bool = False
     """the decoder sees h_t too (Eq. 3.3.1), not only y_t and z_t"""
     decoder_sees_c: bool = False
@@ -177,9 +177,16 @@ class Args:
     read_price: float = 0.0
     """price of a read, on the mean read rate"""
     budget: float = 0.15
-    """share of steps read without a price, from 1 over 80% of the updates"""
+    """share of steps read without a price, from 1 over `--budget-updates`"""
     budget_price: float = 50.0
     """price of the reads beyond it, on the mean read rate; 0: no budget"""
+    budget_updates: int = 3_200
+    """updates of an attempt over which budget and temperature come to their last values"""
+    surprise_price: float = 4.0
+    """price of KL_z where z is read, from 0 over `--surprise-updates` after the budget, which is then one from both sides: of
+    two steps at which z could be read, that at which it is foretold better; 0 for none"""
+    surprise_updates: int = 500
+    """updates over which that price grows"""
 
     # to be filled in runtime
     env_id: tyro.conf.Suppress[str] = ""
@@ -222,8 +229,8 @@ def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.attempts * args.total_updates if args.stop_at is None else args.stop_at
     counts = "num_threads checkpoint_interval attempts stop_at train_pairs heldout_episodes total_updates batch_size hidden_size"
-    counts += " deter_z stoch_z deter_w stoch_w"
-    scales = "kl_z_scale kl_w_scale kl_m_scale read_price budget_price boundary_bound"
+    counts += " deter_z stoch_z deter_w stoch_w budget_updates surprise_updates"
+    scales = "kl_z_scale kl_w_scale kl_m_scale read_price budget_price surprise_price boundary_bound"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("chunk_length", lambda x: x >= 2, "must be at least 2"),
@@ -615,20 +622,31 @@ class HWM(nn.Module):
         return self.decoder(torch.cat([use_z * c, use_z * v, use_w * h, use_w * y], -1))
 
 
-def hwm_loss(model: HWM, data: Sequence, temperature: float, budget: float) -> tuple[torch.Tensor, dict]:
-    """−J_HWM (Eq. 3.3.5) per step, and its terms; `budget` is the share of steps that may be read without a price."""
+def hwm_loss(
+    model: HWM, data: Sequence, temperature: float, budget: float, surprise_price: float = 0.0
+) -> tuple[torch.Tensor, dict]:
+    """−J_HWM (Eq. 3.3.5) per step, and its terms.
+
+    budget: the share of steps that may be read without a price; surprise_price: that of a nat by which KL_z of a read that q(m)
+    chose is above their mean, and what a nat below pays.
+    """
     args, made = model.args, model.infer(data, "train", temperature)
     reconstruction = 0.5 * args.image_scale * (model.decode(made.belief) - data.frames).square().sum(-1)  # (T, B)
     p_z, p_w = model.prior_z(made.belief.c), model.low_level(model.prior_w, made.belief.h)
     weight = made.reads.detach() if args.detach_kl_z else made.reads  # Eq. 3.3.7 weighs KL_z by q(M)
-    kl_z = weight * balanced(kl_normal, made.q_z, p_z, args.kl_balance)
+    surprise = balanced(kl_normal, made.q_z, p_z, args.kl_balance)  # of a read, whether or not there is one
+    kl_z = weight * surprise
     kl_w = balanced(kl_normal, made.q_w, p_w, args.kl_balance)
     chosen = 1 - made.forced
     decides = torch.cat([chosen[1:], torch.zeros_like(chosen[:1])])  # m_t of the last step, and before a forced read
     kl_m = decides * balanced(kl_bernoulli, made.q_m, made.p_m, args.kl_balance)
-    read_rate = (made.reads * chosen).sum() / chosen.sum()
+    reads = made.reads * chosen
+    read_rate = reads.sum() / chosen.sum()
     loss = (reconstruction + args.kl_z_scale * kl_z + args.kl_w_scale * kl_w + args.kl_m_scale * kl_m).mean()
-    loss = loss + args.read_price * read_rate + args.budget_price * F.relu(read_rate - budget)
+    excess = read_rate - budget
+    loss = loss + args.read_price * read_rate + args.budget_price * (excess.abs() if surprise_price else F.relu(excess))
+    usual = (reads * surprise).sum() / reads.sum().clamp(min=1)
+    loss = loss + surprise_price * (reads * (surprise - usual).detach()).mean()  # 0, its gradient moves q(m) alone
     terms = {"reconstruction": reconstruction, "kl_z": kl_z, "kl_w": kl_w, "kl_m": kl_m, "read_rate": read_rate}
     agreement = ((made.p_m > 0) == (made.q_m > 0)).float()
     terms["agreement"] = (agreement * decides).sum() / decides.sum()
@@ -766,22 +784,23 @@ def normalised_mutual_information(a: np.ndarray, b: np.ndarray) -> float:
 LOG_INTERVAL = 50  # updates between rows of updates.csv
 
 
-def schedule(args: Args, update: int) -> tuple[float, float, float]:
-    """Learning rate, temperature and read budget of an update, counted from 0."""
-    update, done = update % args.total_updates, update % args.total_updates / args.total_updates
-    ramp = min(1.0, done / 0.8)
-    rate = args.learning_rate * min(1.0, (update + 1) / 100) * (1.0 if done < 0.7 else 0.3)
-    return rate, 1 + (args.temperature - 1) * ramp, 1 + (args.budget - 1) * ramp
+def schedule(args: Args, update: int) -> tuple[float, float, float, float]:
+    """Learning rate, temperature, read budget and price of surprise of an update, counted from 0."""
+    update %= args.total_updates
+    ramp = min(1.0, update / args.budget_updates)
+    late = min(1.0, max(0, update - args.budget_updates) / args.surprise_updates)
+    rate = args.learning_rate * min(1.0, (update + 1) / 100) * (1.0 if update < 0.7 * args.total_updates else 0.3)
+    return rate, 1 + (args.temperature - 1) * ramp, 1 + (args.budget - 1) * ramp, late * args.surprise_price
 
 
 def train_step(model: HWM, optimizer: torch.optim.Adam, data: Sequence, update: int) -> dict[str, torch.Tensor]:
     """One gradient step on a batch of chunks; returns the terms of the loss before it."""
     args = model.args
-    rate, temperature, budget = schedule(args, update)
+    rate, temperature, budget, surprise_price = schedule(args, update)
     for group in optimizer.param_groups:
         group["lr"] = rate
     starts = torch.randint(len(data.actions) - args.chunk_length + 1, (args.batch_size,)).to(data.actions.device)
-    loss, terms = hwm_loss(model, data.chunks(starts, args.chunk_length), temperature, budget)
+    loss, terms = hwm_loss(model, data.chunks(starts, args.chunk_length), temperature, budget, surprise_price)
     optimizer.zero_grad()
     loss.backward()
     nn.utils.clip_grad_norm_(model.parameters(), args.max_grad_norm)

@@ -565,6 +565,7 @@ def test_the_agent_is_drawn_soon(tmp_path, seed):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not method.has_bf16(CPU), reason="this CPU emulates bfloat16, for ten minutes")
 def test_learning_curve_in_bfloat16_stays_within_seeds_of_float32(tmp_path):
     """Image and KL loss over 300 updates of a CNN model: three seeds in each arithmetic, whose ranges meet at each stage."""
     curves = {}

@@ -219,6 +219,45 @@ def test_prices_of_reads():
     assert priced.item() - plain.item() == pytest.approx(10 * (rate - 0.25) + 3 * rate, rel=1e-3)
 
 
+@pytest.mark.parametrize("budget", [0.1, 0.9])
+def test_price_of_surprise(budget):
+    """A gradient on q(m) alone, towards the chosen reads whose KL_z is below their mean; the budget is one from both sides."""
+    data = make_data([[9], [9]])
+    model = make_model(budget_price=10.0)
+    torch.manual_seed(4)
+    made = model.infer(data, "train")
+    normal, kl = torch.distributions.Normal, torch.distributions.kl_divergence
+    kl_z = kl(normal(*made.q_z), normal(*model.prior_z(made.belief.c))).sum(-1).detach()
+    reads = made.reads * (1 - made.forced)
+    torch.manual_seed(4)
+    plain, terms = method.hwm_loss(model, data, 1.0, 1.0)
+    torch.manual_seed(4)
+    priced, _ = method.hwm_loss(model, data, 1.0, budget, surprise_price=2.0)
+    excess = abs(terms["read_rate"].item() - budget)
+    assert priced.item() - plain.item() == pytest.approx(10 * excess, rel=1e-3)
+    expected = (reads * (kl_z - kl_z[reads > 0].mean())).mean()  # 0
+    model.zero_grad()
+    expected.backward()
+    wanted = model.posterior_m.logit.weight.grad.clone()
+    gradients = []
+    for price in (0.0, 2.0):
+        model.zero_grad()
+        torch.manual_seed(4)
+        method.hwm_loss(model, data, 1.0, terms["read_rate"].item(), price)[0].backward()
+        parts = (model.prior_z.layers[0].weight, model.posterior_z.layers[0].weight, model.posterior_m.logit.weight)
+        gradients.append([part.grad.clone() for part in parts])
+    (prior, posterior, boundary), (later_prior, later_posterior, later_boundary) = gradients
+    assert torch.equal(prior, later_prior) and torch.equal(posterior, later_posterior)
+    assert wanted.abs().max() > 1e-6 and torch.allclose(later_boundary - boundary, 2 * wanted, atol=1e-5)
+
+
+def test_the_price_of_surprise_comes_after_the_budget():
+    args = method.Args(total_updates=100, budget_updates=40, surprise_updates=20, surprise_price=3.0, budget=0.2)
+    made = [method.schedule(args, update) for update in (0, 20, 40, 50, 60, 99, 120)]
+    assert [budget for _, _, budget, _ in made] == pytest.approx([1, 0.6, 0.2, 0.2, 0.2, 0.2, 0.6])
+    assert [price for *_, price in made] == pytest.approx([0, 0, 0, 1.5, 3, 3, 0])
+
+
 @pytest.mark.parametrize("flags", [{}, FAITHFUL], ids=["default", "faithful"])
 def test_nothing_leaks_over_the_border_of_an_episode(flags):
     """Other frames and actions in the second episode of a column change nothing in the first, nor in other columns."""
@@ -565,6 +604,10 @@ def test_report_of_part_of_the_runs(small_run, tmp_path):
     ignorant = [floor for name, floor in segmentation["floors"].items() if name != "at each door"]
     assert rows[0]["best_floor_f1_4_rooms_1"] == max(floor["f1_4_rooms_1"] for floor in ignorant)
     hwm_report.write_report(rows, tmp_path / "runs", tmp_path / "out")
+    known = hwm_report.read_known(tmp_path / "out", rows[:3])
+    assert known == [row for row in rows if row["run"] != rows[0]["run"]]
+    with pytest.raises(SystemExit, match="--known .*: runs.csv cannot be read"):
+        hwm_report.read_known(tmp_path, rows)
     table = (tmp_path / "out" / "table.md").read_text()
     read_rate = segmentation["prior"]["read_rate"]
     assert f"{read_rate:.2f} ± 0.00" in table and "(c)" not in table
