@@ -25,7 +25,7 @@ RUNGS = {
     "reset": "(c) w reset where z is read",
     "price": "(d) a price for each read",
     "narrow": "(e) narrow w, reset, budget",
-    "surprise": "(g) and KL_z is a price, c from z alone",
+    "surprise": "(g) reads drawn to where z is foretold",
     "no_budget": "(e) without the budget",
     "wander": "(f) trained on a player who wanders",
 }

@@ -6,23 +6,24 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
-RUNGS=${RUNGS:-surprise narrow faithful reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
+RUNGS=${RUNGS:-narrow surprise faithful reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
 mkdir -p "$RUNS"
 record() {  # DEMOS flags...: episodes of the player stopped at 1,100,000 steps, unless they are there
   [ -e "$PLAYER/$1/manifest.json" ] || "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-model \
     --run-dir "$PLAYER" --resume "${@:2}" >&2
 }
 record demos --save-demos 2300
-# rung (e): without what (g) adds; (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of that
-NARROW="--kl-z-scale 0.1 --c-sees-w --surprise-price 0 --total-updates 4000"
-FAITHFUL="$NARROW --no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
+# rung (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of it
+FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
 FAITHFUL+=" --stoch-w 16 --kl-m-scale 1 --max-segments 10"
 for rung in $RUNGS; do
   demos=$PLAYER/demos
   case $rung in
-    surprise) flags="" ;;                              # (g) the default
-    narrow) flags="$NARROW" ;;                         # (e)
-    no_budget) flags="$NARROW --budget-price 0" ;;     # (e) without the budget
+    narrow) flags="" ;;                                # (e) the default
+    no_budget) flags="--budget-price 0" ;;             # (e) without the budget
+    surprise)                                          # (g) reads drawn to where z is foretold from z
+      flags="--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --total-updates 5000"
+      ;;
     faithful) flags="$FAITHFUL" ;;
     kl_w) flags="$FAITHFUL --kl-w-scale 1" ;;          # (b) a larger weight of KL_w
     reset) flags="$FAITHFUL --w-reset" ;;              # (c) w starts anew where z is read
@@ -30,7 +31,7 @@ for rung in $RUNGS; do
     wander)                                            # (f) trained on a player who wanders, measured on the other's episodes
       record demos_noise_0.8 --save-demos 500 --demo-noise 0.8
       demos=$PLAYER/demos_noise_0.8
-      flags="$NARROW --heldout-demos $PLAYER/demos --budget 0.03 --narrow-std 0.3 --total-updates 3000 --budget-updates 2400 --chunk-length 64"
+      flags="--heldout-demos $PLAYER/demos --budget 0.03 --narrow-std 0.3 --total-updates 3000 --budget-updates 2400 --chunk-length 64"
       flags+=" --batch-size 8 --max-segment-length 0"
       ;;
     *)
