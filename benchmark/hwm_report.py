@@ -25,9 +25,9 @@ RUNGS = {
     "reset": "(c) w reset where z is read",
     "price": "(d) a price for each read",
     "narrow": "(e) narrow w, reset, budget",
-    "surprise": "(g) reads drawn to where z is foretold",
     "no_budget": "(e) without the budget",
     "wander": "(f) trained on a player who wanders",
+    "surprise": "(g) reads drawn to where z is foretold",
 }
 MEASURES = {
     "f1_8_labels_0": "F1, 8 labels, exact",
@@ -87,7 +87,7 @@ def read_known(folder: Path, rows: list[dict]) -> list[dict]:
     values = {"True": True, "False": False}
     return [
         {
-            key: value if key in words else values.get(value) if value in values else float(value)
+            key: value if key in words else values[value] if value in values else float(value)
             for key, value in row.items()
         }
         | {"seed": int(row["seed"])}
