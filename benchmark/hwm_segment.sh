@@ -22,7 +22,7 @@ for rung in $RUNGS; do
     narrow) flags="" ;;                                # (e) the default
     no_budget) flags="--budget-price 0" ;;             # (e) without the budget
     surprise)                                          # (g) reads drawn to where z is foretold from z
-      flags="--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --total-updates 5000"
+      flags="--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --total-updates 5000 --budget-updates 3200"
       ;;
     faithful) flags="$FAITHFUL" ;;
     kl_w) flags="$FAITHFUL --kl-w-scale 1" ;;          # (b) a larger weight of KL_w
@@ -31,7 +31,7 @@ for rung in $RUNGS; do
     wander)                                            # (f) trained on a player who wanders, measured on the other's episodes
       record demos_noise_0.8 --save-demos 500 --demo-noise 0.8
       demos=$PLAYER/demos_noise_0.8
-      flags="--heldout-demos $PLAYER/demos --budget 0.03 --narrow-std 0.3 --total-updates 3000 --budget-updates 2400 --chunk-length 64"
+      flags="--heldout-demos $PLAYER/demos --budget 0.03 --narrow-std 0.3 --total-updates 3000 --chunk-length 64"
       flags+=" --batch-size 8 --max-segment-length 0"
       ;;
     *)

@@ -21,7 +21,7 @@ be sent again after every crash: on the same machine the run ends with the same 
 The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 without the last three lines:
 `--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0
 --read-bias 0 --stoch-w 16 --kl-m-scale 1 --max-segments 10`; rung (g), which draws reads to where z is foretold:
-`--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --total-updates 5000`; the others are in `benchmark/hwm_segment.sh`.
+`--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --total-updates 5000 --budget-updates 3200`; the others are in `benchmark/hwm_segment.sh`.
 Frames are shrunk and centred, and the agent's red counts more.
 """
 
@@ -181,8 +181,8 @@ class Args:
     """share of steps read without a price, from 1 over `--budget-updates`"""
     budget_price: float = 50.0
     """price of the reads beyond it, on the mean read rate; 0: no budget"""
-    budget_updates: int = 3_200
-    """updates of an attempt over which budget and temperature come to their last values"""
+    budget_updates: int | None = None
+    """updates of an attempt over which budget and temperature come to their last values; default: 80% of them"""
     surprise_price: float = 0.0
     """price of a nat by which KL_z of a read is above their mean, from 0 over `--surprise-updates` after the budget, which is then
     one from both sides: z is rather read where it is foretold; 0 for none"""
@@ -229,6 +229,7 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.attempts * args.total_updates if args.stop_at is None else args.stop_at
+    args.budget_updates = math.ceil(0.8 * args.total_updates) if args.budget_updates is None else args.budget_updates
     counts = "num_threads checkpoint_interval attempts stop_at train_pairs heldout_episodes total_updates batch_size hidden_size"
     counts += " deter_z stoch_z deter_w stoch_w budget_updates surprise_updates"
     scales = "kl_z_scale kl_w_scale kl_m_scale read_price budget_price surprise_price boundary_bound"
