@@ -22,7 +22,7 @@ for rung in $RUNGS; do
     narrow) flags="" ;;                                # (e) the default
     no_budget) flags="--budget-price 0" ;;             # (e) without the budget
     surprise)                                          # (g) reads drawn to where z is foretold from z
-      flags="--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --total-updates 5000 --budget-updates 3200"
+      flags="--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --foretell-copies 0.1 --total-updates 5000 --budget-updates 3200 --compile"
       ;;
     faithful) flags="$FAITHFUL" ;;
     kl_w) flags="$FAITHFUL --kl-w-scale 1" ;;          # (b) a larger weight of KL_w
