@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -652,9 +653,18 @@ def test_report_of_part_of_the_runs(small_run, tmp_path):
     ]
 
 
+def test_above_the_floors():
+    measured = {"f1_4_rooms_0": 0.2, "f1_4_rooms_1": 0.7, "f1_4_rooms_either": 0.6}
+    floors = {"best_floor_f1_4_rooms_0": 0.3, "best_floor_f1_4_rooms_1": 0.6, "best_floor_f1_4_rooms_either": 0.5}
+    row = {**measured, **floors}
+    assert hwm_report.above_floors([row, {**row, "f1_4_rooms_1": 0.6}]) == ["1 of 2", "1 of 2", "0 of 2"]
+    assert hwm_report.above_floors([row, {**row, "f1_4_rooms_either": math.nan}]) == ["2 of 2", "", "0 of 2"]
+    assert hwm_report.best_floors([row, row], ("read_rate", "f1_4_rooms_1")) == ["", "0.60"]
+
+
 def test_interval_of_two_seeds():
     assert hwm_report.interval([1.0, 2.0]) == "1.50 ± 6.35"  # 12.706 · 0.7071 / √2
-    assert hwm_report.interval([1.0]) == "1.00"
+    assert hwm_report.interval([1.0]) == "1.00" and hwm_report.interval([1.0, math.nan]) == ""
 
 
 @pytest.mark.parametrize(
@@ -697,10 +707,13 @@ def test_report_of_agreement(small_run, tmp_path):
         result = json.loads((folder / "result.json").read_text())
         (folder / "result.json").write_text(json.dumps({**result, "seed": int(name[-1])}))
     halve_kl_m(tmp_path / "runs" / "narrow_seed3" / "updates.csv")
-    args = hwm_agreement.Args(runs=tmp_path / "runs", size=1, trained=2, first_seed=2, out=tmp_path / "out")
+    args = hwm_agreement.Args(
+        runs=tmp_path / "runs", rung="narrow", size=1, trained=2, first_seed=2, out=tmp_path / "out"
+    )
     hwm_agreement.main(args)
-    assert sorted(path.name for path in args.out.iterdir()) == ["agreement.csv", "agreement.md", "agreement.png"]
-    rows = list(csv.DictReader((args.out / "agreement.csv").open()))
+    names = [f"agreement_narrow.{ending}" for ending in ("csv", "md", "png")]
+    assert sorted(path.name for path in args.out.iterdir()) == names
+    rows = list(csv.DictReader((args.out / names[0]).open()))
     assert [(row["boundaries"], row["seeds"]) for row in rows] == [
         *(("one model", "2"), ("one model", "3"), ("1 of 2 models agree", "3"))
     ]
@@ -708,4 +721,4 @@ def test_report_of_agreement(small_run, tmp_path):
     measured = json.loads((small_run / "segmentation.json").read_text())["prior"]
     assert all(float(rows[0][key]) == measured[key] for key in hwm_agreement.MEASURES)
     with pytest.raises(SystemExit, match=r"--runs .* has 1 finished runs narrow_seedN"):
-        hwm_agreement.main(hwm_agreement.Args(runs=tmp_path / "runs", trained=2, first_seed=3, out=tmp_path / "out"))
+        hwm_agreement.main(replace(args, first_seed=3))
