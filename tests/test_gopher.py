@@ -90,8 +90,8 @@ def filled(tmp_path: Path, rows: int, spare: int, seed: int = 0) -> tuple[dqn.Re
             frame = np.array([row, game], np.uint8)
             history[game] = [*history[game], frame] if ages[game] else [frame]
             follows = rng.choice([dqn.GOES_ON, dqn.ENDS], p=[0.8, 0.2])
-            if before[game] == dqn.ENDS:
-                follows = dqn.NOT_PLAYED
+            if rng.random() < (0.5, 0.1, 0)[(dqn.ENDS, dqn.GOES_ON, dqn.NOT_PLAYED).index(before[game])]:
+                follows = dqn.NOT_PLAYED  # else ENDS was the loss of a life; behind GOES_ON it is a time-out
             buffer.add(game, frame, ages[game], row % 5, float(row), follows)
             padded = [history[game][0]] * STACK + history[game]
             expected.append((row, game, np.array(padded[-STACK:]), follows))
@@ -101,23 +101,31 @@ def filled(tmp_path: Path, rows: int, spare: int, seed: int = 0) -> tuple[dqn.Re
     return buffer, expected
 
 
+@pytest.mark.parametrize("n_step", [1, 3])
 @pytest.mark.parametrize("rows, spare", [(100, 10), (20, 5)], ids=["all", "the newest"])
-def test_what_is_drawn_is_what_was_seen(rows, spare, tmp_path):
+def test_what_is_drawn_is_what_was_seen(rows, spare, n_step, tmp_path):
     buffer, expected = filled(tmp_path, rows, spare)
     by_frame = {(row, game): (obs, follows) for row, game, obs, follows in expected}
-    minibatch = buffer.sample(4_000, 0.9, np.random.default_rng(1))
+    minibatch = buffer.sample(4_000, 0.9, n_step, np.random.default_rng(1))
     seen = set()
-    for obs, action, reward, discount, next_obs in zip(*map(torch.Tensor.tolist, minibatch)):
+    for obs, action, sum_of_rewards, discount, next_obs in zip(*map(torch.Tensor.tolist, minibatch)):
         row, game = obs[-1]
         wanted, follows = by_frame[row, game]
         assert obs == wanted.tolist() and follows != dqn.NOT_PLAYED
-        assert (action, reward) == (row % 5, row)
-        assert discount == pytest.approx(0.9 if follows == dqn.GOES_ON else 0)
-        assert next_obs == by_frame[row + 1, game][0].tolist()
+        rewards, last = [float(row)], row  # each row's reward is its number
+        while by_frame[last, game][1] == dqn.GOES_ON and len(rewards) < n_step:
+            if by_frame[last + 1, game][1] == dqn.NOT_PLAYED:
+                break
+            last += 1
+            rewards.append(float(last))
+        assert action == row % 5 and sum_of_rewards == pytest.approx(sum(0.9**k * r for k, r in enumerate(rewards)))
+        goes_on = by_frame[last, game][1] == dqn.GOES_ON
+        assert discount == pytest.approx(0.9 ** len(rewards) if goes_on else 0)
+        assert not goes_on or next_obs == by_frame[last + 1, game][0].tolist()
         seen.add((row, game))
     first = 0 if rows > FRAMES else FRAMES - rows + STACK - 1
     played = {key for key, (_, follows) in by_frame.items() if follows != dqn.NOT_PLAYED}
-    assert seen == {(row, game) for row, game in played if first <= row < FRAMES - 1}
+    assert seen == {(row, game) for row, game in played if first <= row < FRAMES - n_step}
 
 
 def test_a_million_frames_take_seven_gigabytes():
