@@ -12,8 +12,8 @@ p(m) reads, each vote counts for the steps beside it too, but less, and a bounda
 half of the number of models. Of `--trained` models the `--size` with the least KL_m are taken: those whose p(m), which sees only
 the present state, foretells best q(m), which sees the frames that follow.
 
-`KERNEL` and `SHARE` were chosen on seeds 1 to 8 of rung (e), `--size` on six other models; the committees of the tables are of
-other seeds, and have none in common.
+The vote (`hwm_segment.agree`) was chosen on seeds 1 to 8 of rung (e), `--size` on six other models of rung (g); the committees of
+the tables are of other seeds, and have none in common. `hwm_segment.py --attempts 3` trains and measures one committee.
 """
 
 import csv
@@ -34,8 +34,6 @@ from matplotlib.figure import Figure
 sys.path.insert(0, str(ROOT))
 from cleanrl_thesis import hwm_segment as hwm  # noqa: E402
 
-KERNEL = np.array([1, 2, 3, 2, 1]) / 3  # what a vote counts for the steps around it
-SHARE = 0.5  # of the models that a boundary needs
 MEASURES = {
     "f1_4_rooms_0": "F1, 4 rooms, exact",
     "f1_4_rooms_either": "in or behind the door",
@@ -63,20 +61,6 @@ class Args:
     """the first committee is chosen from this seed on"""
     out: Path = ROOT / "benchmark" / "results" / "hwm_segment"
     """folder for the table, the committees and the figure"""
-
-
-def agree(votes: np.ndarray) -> np.ndarray:
-    """Boundaries (T,) bool of the models' (N, T): the greatest sums of votes first, no two within the kernel's reach."""
-    reach, steps = len(KERNEL) // 2, votes.shape[1]
-    agreed = np.zeros(steps, bool)
-    if steps == 0:
-        return agreed
-    sums = np.convolve(votes.sum(0), KERNEL)[reach : reach + steps]
-    while sums.max() > SHARE * len(votes) - 1e-9:
-        t = int(sums.argmax())
-        agreed[t] = True
-        sums[max(0, t - reach) : t + reach + 1] = -1
-    return agreed
 
 
 def read_args(run: Path) -> hwm.Args:
@@ -177,7 +161,7 @@ def main(args: Args) -> None:
         kls = {seed: kl_m(runs[seed]) for seed in group}
         rows += [{**score("one model", [seed], parts[seed][0], episodes), "kl_m": kls[seed]} for seed in group]
         chosen = sorted(sorted(group, key=kls.get)[: args.size])
-        agreed = [agree(np.stack(votes)) for votes in zip(*(parts[seed][0] for seed in chosen))]
+        agreed = [hwm.agree(np.stack(votes)) for votes in zip(*(parts[seed][0] for seed in chosen))]
         whole = args.size == args.trained
         name = f"{args.size} models agree" if whole else f"{args.size} of {args.trained} models agree"
         committees.append({**score(name, chosen, agreed, episodes), "kl_m": np.mean([kls[seed] for seed in chosen])})

@@ -21,8 +21,8 @@ be sent again after every crash: on the same machine the run ends with the same 
 The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 without the last three lines:
 `--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0
 --read-bias 0 --stoch-w 16 --kl-m-scale 1 --max-segments 10`; rung (g), which draws reads to where z is foretold:
-`--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --foretell-copies 0.1 --total-updates 5000 --budget-updates 3200`; the others are
-in `benchmark/hwm_segment.sh`.
+`--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --foretell-copies 0.1 --total-updates 5000 --budget-updates 3200`, with
+`--attempts 3` also the boundaries on which three models agree; the others are in `benchmark/hwm_segment.sh`.
 Frames are shrunk and centred, and the agent's red counts more.
 """
 
@@ -119,7 +119,8 @@ class Args:
 
     # Algorithm
     attempts: int = 1
-    """models trained one after the other, each from weights of its own; that with the greatest J_HWM is kept"""
+    """models trained one after the other, each from weights of its own: that with the greatest J_HWM is kept, and the boundaries on
+    which all of them agree are measured too"""
     total_updates: int = 4_000
     """gradient steps of an attempt"""
     batch_size: int = 16
@@ -696,6 +697,27 @@ def f1_score(found: list[np.ndarray], true: list[np.ndarray], before: int, after
     return {"precision": precision, "recall": recall, "f1": 2 * hits / max(claimed + real, 1)}
 
 
+AGREEMENT_KERNEL = np.array([1, 2, 3, 2, 1]) / 3  # what a model's vote for a boundary counts for the steps around it
+AGREEMENT_SHARE = 0.5  # of the models that a boundary needs
+
+
+def agree(votes: np.ndarray) -> np.ndarray:
+    """Boundaries (T,) bool of N models' (N, T): the greatest sums of votes first, no two within the kernel's reach.
+
+    Each model reads once around a door, but at steps that differ; so does a viewer who presses a button at a cut.
+    """
+    reach, steps = len(AGREEMENT_KERNEL) // 2, votes.shape[1]
+    agreed = np.zeros(steps, bool)
+    if steps == 0:
+        return agreed
+    sums = np.convolve(votes.sum(0), AGREEMENT_KERNEL)[reach : reach + steps]
+    while sums.max() > AGREEMENT_SHARE * len(votes) - 1e-9:
+        t = int(sums.argmax())
+        agreed[t] = True
+        sums[max(0, t - reach) : t + reach + 1] = -1
+    return agreed
+
+
 def near(boundaries: np.ndarray) -> np.ndarray:
     """Which steps are at most one from a boundary, (T - 1,)."""
     padded = np.pad(boundaries, 1)
@@ -862,7 +884,7 @@ def compile_step(model: HWM, data: Sequence, args: Args) -> bool:
 # ---------------------------------------------------------------------------------------------------------------------
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
-CHECKPOINT_FORMAT = "hwm_segment 1"
+CHECKPOINT_FORMAT = "hwm_segment 2"
 FINISH = ("save_model", "heldout_episodes", "heldout_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", "demos", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -1062,6 +1084,16 @@ def held_out_scores(model: HWM, episodes: list[Episode], normalizer: Normalizer,
     return {name: scores[name] for name in ("f1_4_rooms_0", "f1_4_rooms_1", "read_rate", "door_entry_recall")}
 
 
+def agreed_scores(model: HWM, models: list[dict], episodes: list[Episode], normalizer: Normalizer, device) -> dict:
+    """The measures of the boundaries on which models of these parameters agree, m from p."""
+    found = []
+    for parameters in models:
+        model.load_state_dict(parameters)
+        found.append(segment(model, episodes, normalizer, "prior", device).found)
+    agreed = [agree(np.stack(votes)) for votes in zip(*found)]
+    return boundary_scores(agreed, [episode.rooms for episode in episodes])
+
+
 def probes(train: Segmented, test: Segmented, train_episodes: list[Episode], test_episodes: list[Episode]) -> dict:
     """What a linear probe reads from z and from w, and how well the most frequent label does."""
     labels = []
@@ -1152,8 +1184,13 @@ def print_table(segmentation: dict) -> None:
     keys += ("read_rate_inside_rooms",)
     titles = ("F1 8, 0", "F1 8, 1", "F1 4, 0", "F1 4, 1", "reads", "doors", "inside")
     print(f"{'':38}" + "".join(f"{title:>9}" for title in titles))
-    modes = {"prior": "m from p", "sampled": "m drawn from p", "posterior": "m from q"}
-    rows = {title: segmentation[mode] for mode, title in modes.items()} | segmentation["floors"]
+    modes = {
+        "prior": "m from p",
+        "sampled": "m drawn from p",
+        "posterior": "m from q",
+        "agreed": "m where all models agree",
+    }
+    rows = {title: segmentation[mode] for mode, title in modes.items() if mode in segmentation} | segmentation["floors"]
     for name, row in rows.items():
         print(f"{name:38}" + "".join(f"{row[key]:>9.2f}" for key in keys))
 
@@ -1211,10 +1248,10 @@ def main(args: Args) -> int:
 
     data = Sequence(*(column.to(device) for column in data))
     model, optimizer = new_model(args, data, num_actions)
-    update, training_seconds, offset, attempts, best = 0, 0.0, 0, [], None
+    update, training_seconds, offset, attempts, models = 0, 0.0, 0, [], []
     if checkpoint is not None:
         update, training_seconds, offset = checkpoint["update"], checkpoint["training_seconds"], checkpoint["offset"]
-        attempts, best = checkpoint["attempts"], checkpoint["best"]
+        attempts, models = checkpoint["attempts"], checkpoint["models"]
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
     is_compiled = args.compile and update < last_update and compile_step(model, data, args)
@@ -1243,8 +1280,7 @@ def main(args: Args) -> int:
             with torch.random.fork_rng():  # so that what is held out changes nothing
                 scores = held_out_scores(model, episodes.heldout, normalizer, device)
             attempts.append({"objective": objective(model, data), **scores})
-            if best is None or attempts[-1]["objective"] > max(each["objective"] for each in attempts[:-1]):
-                best = {name: value.clone() for name, value in model.state_dict().items()}
+            models.append({name: value.clone() for name, value in model.state_dict().items()})
         crossed = update % args.checkpoint_interval == 0
         ends = update % args.total_updates == 0 or update == last_update
         if not (update % LOG_INTERVAL == 0 or crossed or stop.received or ends):
@@ -1266,7 +1302,7 @@ def main(args: Args) -> int:
                 "training_seconds": training_seconds,
                 "offset": updates_csv.sync(),
                 "attempts": attempts,
-                "best": best,
+                "models": models,
                 "model": model.state_dict(),
                 "optimizer": optimizer.state_dict(),
                 "torch_rng": torch.get_rng_state(),
@@ -1281,8 +1317,10 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    model.load_state_dict(best or model.state_dict())
-    finish_run(model, attempts, episodes, normalizer, args, run_dir, update, training_seconds, device)
+    agreed = agreed_scores(model, models, episodes.heldout, normalizer, device) if len(models) > 1 else None
+    if models:
+        model.load_state_dict(models[int(np.argmax([each["objective"] for each in attempts]))])
+    finish_run(model, attempts, agreed, episodes, normalizer, args, run_dir, update, training_seconds, device)
     writer.close()
     return 0
 
@@ -1290,6 +1328,7 @@ def main(args: Args) -> int:
 def finish_run(
     model: HWM,
     attempts: list,
+    agreed: dict | None,
     episodes: Split,
     normalizer: Normalizer,
     args: Args,
@@ -1300,6 +1339,7 @@ def finish_run(
 ) -> None:
     """Measure, draw Fig. 3.4, save what was asked for, and write `result.json` last."""
     segmentation = {**evaluate(model, episodes, normalizer, args, device), "attempts": attempts}
+    segmentation |= {"agreed": agreed} if agreed else {}
     write_json(run_dir / "segmentation.json", segmentation)
     draw_figure(model, longest_way(episodes.heldout), normalizer, device, run_dir / "figure_3_4.png")
     if args.save_model:

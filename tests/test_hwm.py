@@ -532,6 +532,26 @@ def test_the_attempt_with_the_greatest_objective_is_kept(demos, small_run):
     assert method.objective(model, data) == pytest.approx(max(values), rel=1e-5)
 
 
+def test_boundaries_on_which_the_attempts_agree(demos, small_run):
+    """Measured again from the models in the checkpoint, the better of which is saved."""
+    segmentation = json.loads((small_run / "segmentation.json").read_text())
+    args = method.complete_args(method.parse_args([*map(str, SMALL), "--demos", str(demos)]))
+    split = method.read_split(args)[0]
+    mean = np.concatenate([episode.frames for episode in split.training]).mean(0) / 255
+    normalizer = method.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32))
+    model = method.HWM(args, mean.size, 3)
+    found = []
+    for parameters in torch.load(small_run / "checkpoint.pt", weights_only=True)["models"]:
+        model.load_state_dict(parameters)
+        found.append(method.segment(model, split.heldout, normalizer, "prior", torch.device("cpu")).found)
+    both = [method.agree(np.stack(votes)) for votes in zip(*found)]
+    assert segmentation["agreed"] == method.boundary_scores(both, [episode.rooms for episode in split.heldout])
+    kept = load_file(small_run / "model.safetensors")
+    model.load_state_dict(kept)
+    made = method.segment(model, split.heldout, normalizer, "prior", torch.device("cpu")).found
+    assert segmentation["prior"]["read_rate"] == np.concatenate(made).mean()
+
+
 def test_objective_is_eq_3_3_5_with_every_weight_1():
     model, data = make_model(**FAITHFUL, image_scale=2.0, chunk_length=9), make_data([[5, 4], [9]])
     flat = method.Sequence(*(column.transpose(0, 1).flatten(0, 1) for column in data))
@@ -679,11 +699,11 @@ def test_interval_of_two_seeds():
 )
 def test_where_models_agree(reads, agreed):
     votes = np.stack([np.isin(np.arange(10), each) for each in reads])
-    assert np.flatnonzero(hwm_agreement.agree(votes)).tolist() == agreed
+    assert np.flatnonzero(method.agree(votes)).tolist() == agreed
 
 
 def test_models_of_an_episode_of_one_step_agree():
-    assert hwm_agreement.agree(np.zeros((3, 0), bool)).shape == (0,)
+    assert method.agree(np.zeros((3, 0), bool)).shape == (0,)
 
 
 def test_where_boundaries_are_beside_the_border_of_a_room():
