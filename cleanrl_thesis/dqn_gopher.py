@@ -154,7 +154,7 @@ class Args:
     train_frequency: int = 16
     """frames per update (Baselines)"""
     n_step: int = 1
-    """rewards summed before the value of the next state (Baselines: 1)"""
+    """rewards summed before the value of the state behind them (Baselines: 1)"""
     max_grad_norm: float = 10.0
     """bound on the norm of the gradient; inf for none (Baselines)"""
     double: bool = True
@@ -206,7 +206,10 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
-    counts = "num_threads num_envs frame_skip frame_stack batch_size buffer_size eval_episodes checkpoint_interval stop_at n_step"
+    counts = (
+        "num_threads num_envs frame_skip frame_stack batch_size buffer_size eval_episodes checkpoint_interval stop_at"
+    )
+    counts += " n_step"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("train_frequency target_network_frequency", lambda x: x >= 1, "must be at least 1"),
@@ -225,8 +228,8 @@ def complete_args(args: Args) -> Args:
     args.num_iterations = args.total_timesteps // frames
     allowed = f"must be at least one step of every game, {frames} frames"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
-    least = (args.frame_stack + args.n_step) * args.num_envs
-    allowed = f"must be at least --frame-stack and --n-step frames of every game, {least}"
+    least = (args.frame_stack + args.n_step + 1) * args.num_envs
+    allowed = f"must be at least --frame-stack, --n-step and one more frame of every game, {least}"
     require(args.buffer_size >= least, "--buffer-size", args.buffer_size, allowed)
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")
@@ -443,9 +446,9 @@ class Minibatch(NamedTuple):
 
     obs: torch.Tensor  # (M, S, ...) uint8
     actions: torch.Tensor  # (M,) int64
-    returns: torch.Tensor  # (M,), of n steps, or to the episode's end
-    discounts: torch.Tensor  # (M,), γⁿ, or 0 where the episode ended
-    next_obs: torch.Tensor  # (M, S, ...) uint8, n steps later
+    returns: torch.Tensor  # (M,), of k steps: n, or fewer to the episode's end
+    discounts: torch.Tensor  # (M,), γᵏ, or 0 where the episode ended
+    next_obs: torch.Tensor  # (M, S, ...) uint8, k steps later
 
     def to(self, device: torch.device) -> "Minibatch":
         return Minibatch(*(tensor.to(device) for tensor in self))
@@ -491,7 +494,7 @@ class ReplayBuffer:
         self.added += 1
 
     def sample(self, batch_size: int, gamma: float, n_step: int, rng: np.random.Generator) -> Minibatch:
-        """Transitions of n steps, drawn uniformly; the newest n rows have no next one yet."""
+        """Transitions of n steps, drawn uniformly; the newest n rows have none n steps later yet."""
         oldest = self.added - self.rows
         first = oldest + self.frame_stack - 1 if oldest > 0 else 0
         low, high = first * self.num_envs, (self.added - n_step) * self.num_envs
@@ -503,8 +506,7 @@ class ReplayBuffer:
         for _ in range(n_step):  # to the n-th step, or to that with which the episode ends
             slots = now % total
             returns += np.where(goes_on, discounts * self.fields["reward"][slots], np.float32(0))
-            discounts *= np.where(goes_on, np.float32(gamma), np.float32(1))
-            discounts *= ~goes_on | (self.fields["follows"][slots] != ENDS)
+            discounts *= np.where(goes_on, np.float32(gamma) * (self.fields["follows"][slots] != ENDS), np.float32(1))
             now = now + self.num_envs * goes_on
             goes_on = goes_on & (discounts > 0) & (self.fields["follows"][now % total] != NOT_PLAYED)
         actions = self.fields["action"][picks % total].astype(np.int64)

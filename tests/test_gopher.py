@@ -90,7 +90,7 @@ def filled(tmp_path: Path, rows: int, spare: int, seed: int = 0) -> tuple[dqn.Re
             frame = np.array([row, game], np.uint8)
             history[game] = [*history[game], frame] if ages[game] else [frame]
             follows = rng.choice([dqn.GOES_ON, dqn.ENDS], p=[0.8, 0.2])
-            if rng.random() < (0.5, 0.1, 0)[(dqn.ENDS, dqn.GOES_ON, dqn.NOT_PLAYED).index(before[game])]:
+            if rng.random() < {dqn.ENDS: 0.5, dqn.GOES_ON: 0.1, dqn.NOT_PLAYED: 0}[before[game]]:
                 follows = dqn.NOT_PLAYED  # else ENDS was the loss of a life; behind GOES_ON it is a time-out
             buffer.add(game, frame, ages[game], row % 5, float(row), follows)
             padded = [history[game][0]] * STACK + history[game]
@@ -309,6 +309,15 @@ def test_copied_alone_into_an_empty_folder(small, tmp_path):
     shutil.copy(SCRIPT, tmp_path)
     run(*SMALL, "--run-dir", "run", cwd=tmp_path, script=tmp_path / SCRIPT.name, PYTHONSAFEPATH="1")
     assert (tmp_path / "run" / "updates.csv").read_bytes() == (small / "updates.csv").read_bytes()
+
+
+def test_a_run_learns_from_as_many_steps_as_told(tmp_path):
+    """From the first minibatch on: there are hardly more frames than it needs."""
+    flags = [*RAM, "--total-timesteps", 1_600, "--learning-starts", 0, "--train-frequency", 32]
+    for n_step in (1, 8):
+        run(*flags, "--n-step", n_step, "--run-dir", f"n{n_step}", cwd=tmp_path, script=SCRIPT)
+    one, eight = ((tmp_path / f"n{n_step}" / "updates.csv").read_text() for n_step in (1, 8))
+    assert one != eight and one.count("\n") == eight.count("\n") > 1
 
 
 def test_a_video_is_recorded(tmp_path):
