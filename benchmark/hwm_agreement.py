@@ -8,8 +8,8 @@
 One model reads once on its way into another room, but at which step around the door differs from seed to seed, and from door to
 door, for the bound (Eq. 3.3.5) hardly tells these steps apart. So several models make a committee. Boundaries that people see in
 a film are settled in the same way, by the steps at which many of them press the button: a model votes for the steps at which
-p(m) reads, each vote counts for the steps beside it too, but less, and a boundary is where the sum is greatest, if it is at least
-half of the number of models. Of `--trained` models the `--size` with the least KL_m are taken: those whose p(m), which sees only
+p(m) reads, each vote counts for the steps beside it too, but less, and a boundary is where the sum is greatest, if it is more than
+that of half of the models at one step. Of `--trained` models the `--size` with the least KL_m are taken: those whose p(m), which sees only
 the present state, foretells best q(m), which sees the frames that follow.
 
 The vote (`hwm_segment.agree`) was chosen on seeds 1 to 8 of rung (e), `--size` on six other models of rung (g); the committees of
@@ -118,13 +118,16 @@ def score(name: str, seeds: list[int], found: list[np.ndarray], episodes: list[h
 
 def table(rows: list[dict]) -> list[str]:
     """Models and committees, means with 95% t-intervals, and the best floor."""
-    titles = *MEASURES.values(), f"above floors: {list(FLOORS)[0]}", *list(FLOORS)[1:]
+    titles = *MEASURES.values(), *FLOORS
     lines = [f"| boundaries | of | {' | '.join(titles)} |", "|" + "---|" * (len(titles) + 2)]
     for name in dict.fromkeys(row["boundaries"] for row in rows):
         group = [row for row in rows if row["boundaries"] == name]
         cells = [interval([row[key] for row in group]) for key in MEASURES] + above_floors(group)
         lines.append(f"| {name} | {len(group)} | {' | '.join(cells)} |")
-    return [*lines, f"| best of those that know nothing | | {' | '.join(best_floors(rows, MEASURES))} |{' |' * 3}"]
+    return [
+        *lines,
+        f"| best of those that know nothing | | {' | '.join(best_floors(rows, MEASURES))} |{' |' * len(FLOORS)}",
+    ]
 
 
 def draw(rows: list[dict], path: Path) -> None:
@@ -163,7 +166,7 @@ def main(args: Args) -> None:
         chosen = sorted(sorted(group, key=kls.get)[: args.size])
         agreed = [hwm.agree(np.stack(votes)) for votes in zip(*(parts[seed][0] for seed in chosen))]
         whole = args.size == args.trained
-        name = f"{args.size} models agree" if whole else f"{args.size} of {args.trained} models agree"
+        name = f"most of {args.size} models" if whole else f"most of {args.size} models of {args.trained}"
         committees.append({**score(name, chosen, agreed, episodes), "kl_m": np.mean([kls[seed] for seed in chosen])})
     rows += committees
     results = [json.loads((runs[seed] / "result.json").read_text()) for group in groups for seed in group]

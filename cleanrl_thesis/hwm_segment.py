@@ -22,7 +22,7 @@ The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3
 `--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0
 --read-bias 0 --stoch-w 16 --kl-m-scale 1 --max-segments 10`; rung (g), which draws reads to where z is foretold:
 `--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --foretell-copies 0.1 --total-updates 5000 --budget-updates 3200`, with
-`--attempts 3` also the boundaries on which three models agree; the others are in `benchmark/hwm_segment.sh`.
+`--attempts 3` also the boundaries on which most of three models agree; the others are in `benchmark/hwm_segment.sh`.
 Frames are shrunk and centred, and the agent's red counts more.
 """
 
@@ -120,7 +120,7 @@ class Args:
     # Algorithm
     attempts: int = 1
     """models trained one after the other, each from weights of its own: that with the greatest J_HWM is kept, and the boundaries on
-    which all of them agree are measured too"""
+    which most of them agree are measured too"""
     total_updates: int = 4_000
     """gradient steps of an attempt"""
     batch_size: int = 16
@@ -189,7 +189,7 @@ class Args:
     """price of a nat by which KL_z of a read is above their mean, from 0 over `--surprise-updates` after the budget, which is then
     one from both sides: z is rather read where it is foretold; 0 for none"""
     foretell_copies: float = 0.0
-    """weight of KL_z where z is copied, which trains p(z) and not q(z): how surprising would a read be there?"""
+    """weight of KL_z at steps that copy, q(z) held: p(z) learns how surprising a read there would be"""
     surprise_updates: int = 500
     """updates over which that price grows"""
 
@@ -507,7 +507,7 @@ class Inference(NamedTuple):
     reads: torch.Tensor  # (T, B): 1 where z was read, 0 where it was copied
     forced: torch.Tensor  # (T, B): 1 where the read or copy was not the model's choice
     updated: torch.Tensor  # (T, B, deter_z): c_t if z is read
-    q_z: Normal  # (T, B, stoch_z), of a read too
+    q_z: Normal  # (T, B, stoch_z), if z is read
     q_w: Normal  # (T, B, stoch_w)
     q_m: torch.Tensor  # (T, B): logits
     p_m: torch.Tensor  # (T, B): logits
@@ -553,7 +553,7 @@ class HWM(nn.Module):
         return Belief(*(like.new_zeros(batch, size) for size in sizes))
 
     def step(self, state: Belief, previous_action, read, begins, embed, noise: tuple, z_from_prior: bool) -> tuple:
-        """One step: the belief at t from that at t − 1, c_t of a read whether or not there is one, and q(v_t) of it and q(y_t).
+        """One step: the belief at t from that at t − 1; c_t and q(v_t) as they are if z is read; q(y_t).
 
         previous_action (B, A), read and begins (B, 1), embed (B, E); noise are standard normal draws for v and y, or zeros.
         """
@@ -676,7 +676,7 @@ def merge_doors(rooms: np.ndarray) -> np.ndarray:
 
 
 def matches(found: np.ndarray, true: np.ndarray, before: int, after: int) -> int:
-    """The largest number of pairs of boundaries, each used once, of which the one found is so many steps before or after at most."""
+    """The largest number of pairs of boundaries, each used once, the found one at most `before` steps early or `after` late."""
     found, true = np.flatnonzero(found).tolist(), np.flatnonzero(true).tolist()
     count = i = j = 0
     while i < len(found) and j < len(true):
@@ -697,21 +697,21 @@ def f1_score(found: list[np.ndarray], true: list[np.ndarray], before: int, after
     return {"precision": precision, "recall": recall, "f1": 2 * hits / max(claimed + real, 1)}
 
 
-AGREEMENT_KERNEL = np.array([1, 2, 3, 2, 1]) / 3  # what a model's vote for a boundary counts for the steps around it
-AGREEMENT_SHARE = 0.5  # of the models that a boundary needs
+AGREEMENT_KERNEL = np.array([1, 2, 3, 2, 1])  # what a model's vote for a boundary counts for the steps around it
 
 
 def agree(votes: np.ndarray) -> np.ndarray:
-    """Boundaries (T,) bool of N models' (N, T): the greatest sums of votes first, no two within the kernel's reach.
+    """Boundaries (T − 1,) of N models' (N, T − 1): where the sum of votes is that of more than half of the models at one step.
 
-    Each model reads once around a door, but at steps that differ; so does a viewer who presses a button at a cut.
+    The greatest sums come first, no two within the kernel's reach. Each model reads once around a door, but at steps that differ;
+    so do viewers who press a button at a cut.
     """
     reach, steps = len(AGREEMENT_KERNEL) // 2, votes.shape[1]
     agreed = np.zeros(steps, bool)
     if steps == 0:
         return agreed
     sums = np.convolve(votes.sum(0), AGREEMENT_KERNEL)[reach : reach + steps]
-    while sums.max() > AGREEMENT_SHARE * len(votes) - 1e-9:
+    while 2 * sums.max() > AGREEMENT_KERNEL.max() * len(votes):
         t = int(sums.argmax())
         agreed[t] = True
         sums[max(0, t - reach) : t + reach + 1] = -1
@@ -727,8 +727,8 @@ def near(boundaries: np.ndarray) -> np.ndarray:
 def boundary_scores(found: list[np.ndarray], rooms: list[np.ndarray]) -> dict[str, float]:
     """All measures of boundaries for episodes with room labels (T,) each.
 
-    `_0` is exact, `_1` within a step; `4_rooms_either` lets a crossing be found in the door or at the first cell behind it, for
-    the door can be of either room.
+    `_0` is exact, `_1` within a step; `4_rooms_either` takes the last step in the door or the first behind it, for the door can
+    be of either room.
     """
     scores = {"read_rate": float(np.concatenate(found).mean())}
     scores["segment_length"] = sum(map(len, rooms)) / (sum(int(part.sum()) for part in found) + len(rooms))
@@ -1085,7 +1085,7 @@ def held_out_scores(model: HWM, episodes: list[Episode], normalizer: Normalizer,
 
 
 def agreed_scores(model: HWM, models: list[dict], episodes: list[Episode], normalizer: Normalizer, device) -> dict:
-    """The measures of the boundaries on which models of these parameters agree, m from p."""
+    """The measures of the boundaries on which most models of these parameters agree, m from p."""
     found = []
     for parameters in models:
         model.load_state_dict(parameters)
@@ -1188,7 +1188,7 @@ def print_table(segmentation: dict) -> None:
         "prior": "m from p",
         "sampled": "m drawn from p",
         "posterior": "m from q",
-        "agreed": "m where all models agree",
+        "agreed": "m where most models agree",
     }
     rows = {title: segmentation[mode] for mode, title in modes.items() if mode in segmentation} | segmentation["floors"]
     for name, row in rows.items():

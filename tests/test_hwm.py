@@ -283,6 +283,21 @@ def test_the_prior_learns_to_foretell_where_z_is_copied():
     assert losses[0][1] == losses[1][1]  # the bound's own terms are without it
 
 
+def test_foretelling_leaves_q_alone():
+    """What is seen at a step that copies moves q(z) and q(m), and so nothing of that term."""
+    data, gradients = make_data([[2]]), []
+    for weight in (0.0, 5.0):
+        model = make_model(read_bias=-4.0, foretell_copies=weight)
+        frames = data.frames.clone().requires_grad_()
+        torch.manual_seed(4)
+        assert model.infer(data, "train").reads[1].item() == 0
+        torch.manual_seed(4)
+        method.hwm_loss(model, data._replace(frames=frames), 1.0, 1.0)[0].backward()
+        gradients.append(frames.grad)
+    first, second = (gradients[1] - gradients[0]).abs().amax((1, 2))
+    assert first > 1e-4 and second < 1e-6
+
+
 def test_the_price_of_surprise_comes_after_the_budget():
     args = method.Args(total_updates=100, budget_updates=40, surprise_updates=20, surprise_price=3.0, budget=0.2)
     made = [method.schedule(args, update) for update in (0, 20, 40, 50, 60, 99, 120)]
@@ -532,24 +547,22 @@ def test_the_attempt_with_the_greatest_objective_is_kept(demos, small_run):
     assert method.objective(model, data) == pytest.approx(max(values), rel=1e-5)
 
 
-def test_boundaries_on_which_the_attempts_agree(demos, small_run):
-    """Measured again from the models in the checkpoint, the better of which is saved."""
-    segmentation = json.loads((small_run / "segmentation.json").read_text())
+def test_boundaries_on_which_most_attempts_agree(demos, small_run):
+    """The models of the checkpoint, and such as read always and never."""
     args = method.complete_args(method.parse_args([*map(str, SMALL), "--demos", str(demos)]))
     split = method.read_split(args)[0]
     mean = np.concatenate([episode.frames for episode in split.training]).mean(0) / 255
     normalizer = method.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32))
     model = method.HWM(args, mean.size, 3)
-    found = []
-    for parameters in torch.load(small_run / "checkpoint.pt", weights_only=True)["models"]:
-        model.load_state_dict(parameters)
-        found.append(method.segment(model, split.heldout, normalizer, "prior", torch.device("cpu")).found)
-    both = [method.agree(np.stack(votes)) for votes in zip(*found)]
-    assert segmentation["agreed"] == method.boundary_scores(both, [episode.rooms for episode in split.heldout])
-    kept = load_file(small_run / "model.safetensors")
-    model.load_state_dict(kept)
-    made = method.segment(model, split.heldout, normalizer, "prior", torch.device("cpu")).found
-    assert segmentation["prior"]["read_rate"] == np.concatenate(made).mean()
+    trained = torch.load(small_run / "checkpoint.pt", weights_only=True)["models"]
+    *_, bias = (name for name in trained[0] if name.startswith("prior_m."))
+    always, never = ({**trained[0], bias: torch.full((1,), logit)} for logit in (1e4, -1e4))
+    scores = {}
+    for name, models in (("two", [always, never, always]), ("one", [never, always, never]), ("run", trained)):
+        scores[name] = method.agreed_scores(model, models, split.heldout, normalizer, torch.device("cpu"))
+    assert scores["one"]["read_rate"] == 0 < scores["two"]["read_rate"]
+    segmentation = json.loads((small_run / "segmentation.json").read_text())
+    assert len(trained) == 2 and segmentation["agreed"] == scores["run"]
 
 
 def test_objective_is_eq_3_3_5_with_every_weight_1():
@@ -680,6 +693,9 @@ def test_above_the_floors():
     assert hwm_report.above_floors([row, {**row, "f1_4_rooms_1": 0.6}]) == ["1 of 2", "1 of 2", "0 of 2"]
     assert hwm_report.above_floors([row, {**row, "f1_4_rooms_either": math.nan}]) == ["2 of 2", "", "0 of 2"]
     assert hwm_report.best_floors([row, row], ("read_rate", "f1_4_rooms_1")) == ["", "0.60"]
+    rows = [{**row, "best_floor_f1_4_rooms_1": value} for value in (math.nan, 0.5)]
+    assert hwm_report.best_floors(rows, ("f1_4_rooms_1",)) == ["0.50"]
+    assert hwm_report.best_floors(rows[:1], ("f1_4_rooms_1",)) == [""]
 
 
 def test_interval_of_two_seeds():
@@ -692,7 +708,12 @@ def test_interval_of_two_seeds():
     [
         ([[4], [5], [5], [], []], [5]),  # 2 + 2/3 of five
         ([[4], [5], [6], [], []], []),  # 1 + 2 · 2/3 of five
-        ([[2], [2], [2], [7], [7], [7]], [2, 7]),
+        ([[2], [2], [2], [7], [7], [7]], []),  # half of them is not most
+        ([[2], [2, 7], [2, 7], [7], [2, 7]], [2, 7]),
+        ([[4], []], []),  # one of two
+        ([[4], [5], []], [4]),  # two of three, a step apart
+        ([[4], [6], []], []),  # two steps apart: 1 + 1/3 of three
+        ([[4], [6], [6]], [6]),
         ([[0, 9], [0, 9], [0, 9]], [0, 9]),  # at the ends of the episode
         ([[3, 4, 5], [3, 4, 5], [3, 4, 5]], [4]),  # one event, not three
     ],
@@ -735,7 +756,7 @@ def test_report_of_agreement(small_run, tmp_path):
     assert sorted(path.name for path in args.out.iterdir()) == names
     rows = list(csv.DictReader((args.out / names[0]).open()))
     assert [(row["boundaries"], row["seeds"]) for row in rows] == [
-        *(("one model", "2"), ("one model", "3"), ("1 of 2 models agree", "3"))
+        *(("one model", "2"), ("one model", "3"), ("most of 1 models of 2", "3"))
     ]
     assert float(rows[0]["kl_m"]) == 2 * float(rows[1]["kl_m"]) == 2 * float(rows[2]["kl_m"]) > 0
     measured = json.loads((small_run / "segmentation.json").read_text())["prior"]
