@@ -715,7 +715,8 @@ def test_interval_of_two_seeds():
         ([[4], [6], []], []),  # two steps apart: 1 + 1/3 of three
         ([[4], [6], [6]], [6]),
         ([[0, 9], [0, 9], [0, 9]], [0, 9]),  # at the ends of the episode
-        ([[3, 4, 5], [3, 4, 5], [3, 4, 5]], [4]),  # one event, not three
+        ([[3, 4, 5], [3, 4, 5], [3, 4, 5]], [3]),  # one event, not three
+        ([[3, 4, 5], [], []], []),  # of one model
     ],
 )
 def test_where_models_agree(reads, agreed):
