@@ -1,7 +1,7 @@
 """Where several world models agree that a segment ends: boundaries by the votes of runs that differ in the seed alone.
 
     RUNGS=surprise SEEDS="$(seq -s ' ' 11 25)" benchmark/hwm_segment.sh
-    python benchmark/hwm_agreement.py     # runs/hwm_segment -> benchmark/results/hwm_segment/agreement_surprise.md and a figure
+    python benchmark/hwm_agreement.py     # runs/hwm_segment -> benchmark/results/hwm_segment/agreement_surprise_3.md and a figure
     RUNGS=narrow SEEDS="$(seq -s ' ' 34 63)" benchmark/hwm_segment.sh
     python benchmark/hwm_agreement.py --rung narrow --size 5 --trained 10 --first-seed 34
 
@@ -176,9 +176,10 @@ def main(args: Args) -> None:
     text[0] += f"{len(results)} runs {args.rung}, {hours:.1f} core-hours, one thread each."
     text += table(rows)
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / f"agreement_{args.rung}.md").write_text("\n".join(text) + "\n")
-    write_csv(args.out / f"agreement_{args.rung}.csv", rows)
-    draw(rows, args.out / f"agreement_{args.rung}.png")
+    name = f"agreement_{args.rung}_{args.size}"
+    (args.out / f"{name}.md").write_text("\n".join(text) + "\n")
+    write_csv(args.out / f"{name}.csv", rows)
+    draw(rows, args.out / f"{name}.png")
     print("\n".join(text))
 
 

@@ -753,7 +753,7 @@ def test_report_of_agreement(small_run, tmp_path):
         runs=tmp_path / "runs", rung="narrow", size=1, trained=2, first_seed=2, out=tmp_path / "out"
     )
     hwm_agreement.main(args)
-    names = [f"agreement_narrow.{ending}" for ending in ("csv", "md", "png")]
+    names = [f"agreement_narrow_1.{ending}" for ending in ("csv", "md", "png")]
     assert sorted(path.name for path in args.out.iterdir()) == names
     rows = list(csv.DictReader((args.out / names[0]).open()))
     assert [(row["boundaries"], row["seeds"]) for row in rows] == [
