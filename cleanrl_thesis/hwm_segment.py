@@ -703,20 +703,18 @@ AGREEMENT_KERNEL = np.array([1, 2, 3, 2, 1])  # what a model's vote for a bounda
 def agree(votes: np.ndarray) -> np.ndarray:
     """Boundaries (T − 1,) of N models' (N, T − 1): where the votes weigh more than those of half of the models at one step.
 
-    Each model reads once around a door, but at steps that differ; so do viewers who press a button at a cut. A model votes for a
-    step by its nearest read. The greatest sums come first, and use up the reads around them.
+    The greatest sums come first, no two within the kernel's reach. Each model reads once around a door, but at steps that differ;
+    so do viewers who press a button at a cut. Every read votes, so several of one model around a step weigh more than one.
     """
     reach, steps = len(AGREEMENT_KERNEL) // 2, votes.shape[1]
-    agreed, left = np.zeros(steps, bool), votes.copy()
-    while left.any():
-        padded = np.pad(left, ((0, 0), (reach, reach)))
-        weights = [weight * padded[:, i : i + steps] for i, weight in enumerate(AGREEMENT_KERNEL)]
-        sums = np.max(weights, 0).sum(0)
+    agreed = np.zeros(steps, bool)
+    if steps == 0:
+        return agreed
+    sums = np.convolve(votes.sum(0), AGREEMENT_KERNEL)[reach : reach + steps]
+    while 2 * sums.max() > AGREEMENT_KERNEL.max() * len(votes):
         t = int(sums.argmax())
-        if 2 * sums[t] <= AGREEMENT_KERNEL.max() * len(votes):
-            break
         agreed[t] = True
-        left[:, max(0, t - reach) : t + reach + 1] = False
+        sums[max(0, t - reach) : t + reach + 1] = -1
     return agreed
 
 

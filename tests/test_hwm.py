@@ -558,9 +558,9 @@ def test_boundaries_on_which_most_attempts_agree(demos, small_run):
     *_, bias = (name for name in trained[0] if name.startswith("prior_m."))
     always, never = ({**trained[0], bias: torch.full((1,), logit)} for logit in (1e4, -1e4))
     scores = {}
-    for name, models in (("two", [always, never, always]), ("one", [never, always, never]), ("run", trained)):
+    for name, models in (("two", [always, never, always]), ("none", [never, never]), ("run", trained)):
         scores[name] = method.agreed_scores(model, models, split.heldout, normalizer, torch.device("cpu"))
-    assert scores["one"]["read_rate"] == 0 < scores["two"]["read_rate"]
+    assert scores["none"]["read_rate"] == 0 < scores["two"]["read_rate"]
     segmentation = json.loads((small_run / "segmentation.json").read_text())
     assert len(trained) == 2 and segmentation["agreed"] == scores["run"]
 
@@ -715,8 +715,8 @@ def test_interval_of_two_seeds():
         ([[4], [6], []], []),  # two steps apart: 1 + 1/3 of three
         ([[4], [6], [6]], [6]),
         ([[0, 9], [0, 9], [0, 9]], [0, 9]),  # at the ends of the episode
-        ([[3, 4, 5], [3, 4, 5], [3, 4, 5]], [3]),  # one event, not three
-        ([[3, 4, 5], [], []], []),  # of one model
+        ([[3, 4, 5], [3, 4, 5], [3, 4, 5]], [4]),  # one event, not three
+        ([[3, 4, 5], [], []], [4]),  # every read votes: 1 + 2 · 2/3 of three
     ],
 )
 def test_where_models_agree(reads, agreed):
