@@ -153,8 +153,6 @@ class Args:
     """frame of the first update (Baselines)"""
     train_frequency: int = 16
     """frames per update (Baselines)"""
-    n_step: int = 1
-    """rewards summed before the value of the state behind them (Baselines: 1)"""
     max_grad_norm: float = 10.0
     """bound on the norm of the gradient; inf for none (Baselines)"""
     double: bool = True
@@ -209,7 +207,6 @@ def complete_args(args: Args) -> Args:
     counts = (
         "num_threads num_envs frame_skip frame_stack batch_size buffer_size eval_episodes checkpoint_interval stop_at"
     )
-    counts += " n_step"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("train_frequency target_network_frequency", lambda x: x >= 1, "must be at least 1"),
@@ -228,8 +225,8 @@ def complete_args(args: Args) -> Args:
     args.num_iterations = args.total_timesteps // frames
     allowed = f"must be at least one step of every game, {frames} frames"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
-    least = (args.frame_stack + args.n_step + 1) * args.num_envs
-    allowed = f"must be at least --frame-stack, --n-step and one more frame of every game, {least}"
+    least = (args.frame_stack + 2) * args.num_envs  # of two rows to draw from, one may begin no transition
+    allowed = f"must be at least --frame-stack and two more frames of every game, {least}"
     require(args.buffer_size >= least, "--buffer-size", args.buffer_size, allowed)
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")
@@ -446,9 +443,9 @@ class Minibatch(NamedTuple):
 
     obs: torch.Tensor  # (M, S, ...) uint8
     actions: torch.Tensor  # (M,) int64
-    returns: torch.Tensor  # (M,), of k steps: n, or fewer to the episode's end
-    discounts: torch.Tensor  # (M,), γᵏ, or 0 where the episode ended
-    next_obs: torch.Tensor  # (M, S, ...) uint8, k steps later
+    returns: torch.Tensor  # (M,), rewards
+    discounts: torch.Tensor  # (M,), γ, or 0 where the episode ended
+    next_obs: torch.Tensor  # (M, S, ...) uint8
 
     def to(self, device: torch.device) -> "Minibatch":
         return Minibatch(*(tensor.to(device) for tensor in self))
@@ -493,25 +490,19 @@ class ReplayBuffer:
     def next_row(self) -> None:
         self.added += 1
 
-    def sample(self, batch_size: int, gamma: float, n_step: int, rng: np.random.Generator) -> Minibatch:
-        """Transitions of n steps, drawn uniformly; the newest n rows have none n steps later yet."""
+    def sample(self, batch_size: int, gamma: float, rng: np.random.Generator) -> Minibatch:
+        """Transitions that are drawn uniformly; the newest row has no next one yet."""
         oldest = self.added - self.rows
         first = oldest + self.frame_stack - 1 if oldest > 0 else 0
-        low, high = first * self.num_envs, (self.added - n_step) * self.num_envs
+        low, high = first * self.num_envs, (self.added - 1) * self.num_envs
         picks, total = rng.integers(low, high, batch_size), self.slots * self.num_envs
         while (unplayed := self.fields["follows"][picks % total] == NOT_PLAYED).any():
             picks[unplayed] = rng.integers(low, high, unplayed.sum())
-        returns, discounts = np.zeros(batch_size, np.float32), np.ones(batch_size, np.float32)
-        now, goes_on = picks, np.ones(batch_size, bool)
-        for _ in range(n_step):  # to the n-th step, or to that with which the episode ends
-            slots = now % total
-            returns += np.where(goes_on, discounts * self.fields["reward"][slots], np.float32(0))
-            discounts *= np.where(goes_on, np.float32(gamma) * (self.fields["follows"][slots] != ENDS), np.float32(1))
-            now = now + self.num_envs * goes_on
-            goes_on = goes_on & (discounts > 0) & (self.fields["follows"][now % total] != NOT_PLAYED)
-        actions = self.fields["action"][picks % total].astype(np.int64)
-        columns = self.stacked(picks), actions, returns, discounts, self.stacked(now)
-        return Minibatch(*map(torch.from_numpy, columns))
+        slots = picks % total
+        discounts = np.where(self.fields["follows"][slots] == GOES_ON, np.float32(gamma), np.float32(0))
+        columns = self.fields["action"][slots].astype(np.int64), self.fields["reward"][slots], discounts
+        obs, next_obs = self.stacked(picks), self.stacked(picks + self.num_envs)
+        return Minibatch(*map(torch.from_numpy, (obs, *columns, next_obs)))
 
     def stacked(self, picks: np.ndarray) -> np.ndarray:
         """The observations (M, S, ...) whose newest frames are `picks`; an episode's first frame stands in for those before."""
@@ -1120,9 +1111,9 @@ def main(args: Args) -> int:
             add_scalars(writer, charts, global_step)
             progress.set_postfix_str(f"return {episodic_return:.1f}", refresh=False)
 
-        if global_step >= args.learning_starts and buffer.added >= args.frame_stack + args.n_step:
+        if global_step >= args.learning_starts and buffer.added > args.frame_stack:
             for _ in range(global_step // args.train_frequency - before // args.train_frequency):
-                minibatch = buffer.sample(args.batch_size, args.gamma, args.n_step, rng).to(device)
+                minibatch = buffer.sample(args.batch_size, args.gamma, rng).to(device)
                 means.add(learner.update(minibatch, remaining * args.learning_rate))
         if global_step // args.target_network_frequency > before // args.target_network_frequency:
             learner.copy_to_target()

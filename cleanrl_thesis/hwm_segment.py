@@ -188,10 +188,10 @@ class Args:
     surprise_price: float = 0.0
     """price of a nat by which KL_z of a read is above their mean, from 0 over `--surprise-updates` after the budget, which is then
     one from both sides: z is rather read where it is foretold; 0 for none"""
-    foretell_copies: float = 0.0
-    """weight of KL_z at steps that copy, q(z) held: p(z) learns how surprising a read there would be"""
     surprise_updates: int = 500
     """updates over which that price grows"""
+    foretell_copies: float = 0.0
+    """weight of KL_z at steps that copy, q(z) held: p(z) learns how surprising a read there would be"""
 
     # to be filled in runtime
     env_id: tyro.conf.Suppress[str] = ""
@@ -1317,18 +1317,19 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    agreed = agreed_scores(model, models, episodes.heldout, normalizer, device) if len(models) > 1 else None
+    measured = {"attempts": attempts}
+    if len(models) > 1:
+        measured["agreed"] = agreed_scores(model, models, episodes.heldout, normalizer, device)
     if models:
         model.load_state_dict(models[int(np.argmax([each["objective"] for each in attempts]))])
-    finish_run(model, attempts, agreed, episodes, normalizer, args, run_dir, update, training_seconds, device)
+    finish_run(model, measured, episodes, normalizer, args, run_dir, update, training_seconds, device)
     writer.close()
     return 0
 
 
 def finish_run(
     model: HWM,
-    attempts: list,
-    agreed: dict | None,
+    measured: dict,
     episodes: Split,
     normalizer: Normalizer,
     args: Args,
@@ -1337,9 +1338,8 @@ def finish_run(
     seconds,
     device,
 ) -> None:
-    """Measure, draw Fig. 3.4, save what was asked for, and write `result.json` last."""
-    segmentation = {**evaluate(model, episodes, normalizer, args, device), "attempts": attempts}
-    segmentation |= {"agreed": agreed} if agreed else {}
+    """Measure, draw Fig. 3.4, save what was asked for, and write `result.json` last; `measured` is of all attempts."""
+    segmentation = {**evaluate(model, episodes, normalizer, args, device), **measured}
     write_json(run_dir / "segmentation.json", segmentation)
     draw_figure(model, longest_way(episodes.heldout), normalizer, device, run_dir / "figure_3_4.png")
     if args.save_model:

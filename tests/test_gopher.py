@@ -101,31 +101,23 @@ def filled(tmp_path: Path, rows: int, spare: int, seed: int = 0) -> tuple[dqn.Re
     return buffer, expected
 
 
-@pytest.mark.parametrize("n_step", [1, 3])
 @pytest.mark.parametrize("rows, spare", [(100, 10), (20, 5)], ids=["all", "the newest"])
-def test_what_is_drawn_is_what_was_seen(rows, spare, n_step, tmp_path):
+def test_what_is_drawn_is_what_was_seen(rows, spare, tmp_path):
     buffer, expected = filled(tmp_path, rows, spare)
     by_frame = {(row, game): (obs, follows) for row, game, obs, follows in expected}
-    minibatch = buffer.sample(4_000, 0.9, n_step, np.random.default_rng(1))
+    minibatch = buffer.sample(4_000, 0.9, np.random.default_rng(1))
     seen = set()
-    for obs, action, sum_of_rewards, discount, next_obs in zip(*map(torch.Tensor.tolist, minibatch)):
+    for obs, action, reward, discount, next_obs in zip(*map(torch.Tensor.tolist, minibatch)):
         row, game = obs[-1]
         wanted, follows = by_frame[row, game]
         assert obs == wanted.tolist() and follows != dqn.NOT_PLAYED
-        rewards, last = [float(row)], row  # each row's reward is its number
-        while by_frame[last, game][1] == dqn.GOES_ON and len(rewards) < n_step:
-            if by_frame[last + 1, game][1] == dqn.NOT_PLAYED:
-                break
-            last += 1
-            rewards.append(float(last))
-        assert action == row % 5 and sum_of_rewards == pytest.approx(sum(0.9**k * r for k, r in enumerate(rewards)))
-        goes_on = by_frame[last, game][1] == dqn.GOES_ON
-        assert discount == pytest.approx(0.9 ** len(rewards) if goes_on else 0)
-        assert not goes_on or next_obs == by_frame[last + 1, game][0].tolist()
+        assert (action, reward) == (row % 5, row)
+        assert discount == pytest.approx(0.9 if follows == dqn.GOES_ON else 0)
+        assert next_obs == by_frame[row + 1, game][0].tolist()
         seen.add((row, game))
     first = 0 if rows > FRAMES else FRAMES - rows + STACK - 1
     played = {key for key, (_, follows) in by_frame.items() if follows != dqn.NOT_PLAYED}
-    assert seen == {(row, game) for row, game in played if first <= row < FRAMES - n_step}
+    assert seen == {(row, game) for row, game in played if first <= row < FRAMES - 1}
 
 
 def test_a_million_frames_take_seven_gigabytes():
@@ -309,15 +301,6 @@ def test_copied_alone_into_an_empty_folder(small, tmp_path):
     shutil.copy(SCRIPT, tmp_path)
     run(*SMALL, "--run-dir", "run", cwd=tmp_path, script=tmp_path / SCRIPT.name, PYTHONSAFEPATH="1")
     assert (tmp_path / "run" / "updates.csv").read_bytes() == (small / "updates.csv").read_bytes()
-
-
-def test_a_run_learns_from_as_many_steps_as_told(tmp_path):
-    """From the first minibatch on: there are hardly more frames than it needs."""
-    flags = [*RAM, "--total-timesteps", 1_600, "--learning-starts", 0, "--train-frequency", 32]
-    for n_step in (1, 8):
-        run(*flags, "--n-step", n_step, "--run-dir", f"n{n_step}", cwd=tmp_path, script=SCRIPT)
-    one, eight = ((tmp_path / f"n{n_step}" / "updates.csv").read_text() for n_step in (1, 8))
-    assert one != eight and one.count("\n") == eight.count("\n") > 1
 
 
 def test_a_video_is_recorded(tmp_path):

@@ -32,8 +32,6 @@ BAD_GOPHER = [
     (["--obs-type", "sound"], ["--obs-type", "sound"]),
     (["--total-timesteps", 31], ["--total-timesteps", "31", "32 frames"]),
     (["--buffer-size", 47], ["--buffer-size", "47", "48"]),
-    (["--n-step", 3, "--buffer-size", 63], ["--buffer-size", "63", "64"]),
-    (["--n-step", 0], ["--n-step", "0"]),
     (["--hidden-size", 33], ["--hidden-size", "33", "even"]),
     (["--frame-stack", 256], ["--frame-stack", "256", "255"]),
     (["--noop-max", "-1"], ["--noop-max", "-1"]),
