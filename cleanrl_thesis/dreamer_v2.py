@@ -14,7 +14,7 @@ sampled. `--run-dir DIR --resume` can be sent again after every crash: on the sa
 | image | pixels / 255 − 0.5, weight 1 | mean frame subtracted, channels of unit size, weight 0.25 |
 | KL | scale 0.1 | scale 1 after a warm-up of 1,000 updates: at 0.1 it pays to ignore the agent, a few pixels |
 | codes | | their entropy counts at first: in 3 of 4 seeds they got sharp with the goal alone, and saw no agent |
-| batches | 16 × 50, all states start a dream | 24 × 10, 128 states start one |
+| batches | 16 × 50, all states start a dream | 24 × 10, 64 states start one |
 | γ | 0.999 | 0.99: the frame does not show the time that a reward depends on, so only γ makes the agent hurry |
 | Adam's ε | 1e-5 | 1e-8 for actor and critic: their gradients are so small that 1e-5 stalls them |
 | random play at first | not said | 200,000 steps, with about 110 rewards; 50,000 hold 32, too few to foretell one |
@@ -209,7 +209,7 @@ SIZES = {
         "batch_size": 24,
         "chunk_length": 10,
         "rewarded_share": 0.1,
-        "starts": 128,
+        "starts": 64,
         "gamma": 0.99,
         "image_scale": 0.25,
         "kl_scale": 1.0,
