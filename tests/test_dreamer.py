@@ -16,6 +16,7 @@ from cleanrl_thesis import dreamer_v2 as method
 
 sys.path.append(str(ROOT / "benchmark"))
 import dreamer_report  # noqa: E402
+import dreamer_true  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "dreamer_v2.py"
 CPU = torch.device("cpu")
@@ -365,72 +366,11 @@ def test_critic_and_actor_on_a_chain():
     assert (policy[:, 1] > 0.95).all(), policy
 
 
-class RoomState(NamedTuple):
-    pose: torch.Tensor  # (N,)
-    goal: torch.Tensor  # (N,)
-
-    def features(self) -> torch.Tensor:
-        """One-hot cell, direction and goal; scaled, for a first layer makes little of single ones."""
-        return (
-            8
-            * torch.cat(
-                [F.one_hot(self.pose // 4, 68), F.one_hot(self.pose % 4, 4), F.one_hot(self.goal, 68)], -1
-            ).float()
-        )
-
-
-class Rooms(torch.nn.Module):
-    """The true dynamics of FourRooms11 in the place of the world model; a reward does not know of the time."""
-
-    feature_size, num_actions = 140, 3
-
-    def __init__(self):
-        super().__init__()
-        self.unused = torch.nn.Parameter(torch.zeros(1))
-        self.moves = torch.from_numpy(method.maze(11).moves)
-
-    def noise(self, *shape):
-        return torch.zeros(*shape, 1)
-
-    def imagine_step(self, state, action, noise):
-        return RoomState(self.moves[state.pose, action.argmax(-1)], state.goal)
-
-    def outcome(self, features):
-        reached = (features[..., :68].argmax(-1) == features[..., 72:].argmax(-1)).float()
-        return reached, 1 - reached
-
-
-def true_return(behaviour: method.Behaviour) -> float:
-    """Mean return of the greedy policy from all starts, by tables."""
-    maze = method.maze(11)
-    pose, goal = torch.from_numpy(maze.starts.T.copy())
-    returns, ended = torch.zeros(len(pose)), torch.zeros(len(pose), dtype=torch.bool)
-    for step in range(1, 101):
-        with torch.no_grad():
-            action = behaviour.policy(RoomState(pose, goal).features()).argmax(-1)
-        pose = torch.from_numpy(maze.moves)[pose, action]
-        reached = (pose // 4 == goal) & ~ended
-        returns[reached] = 1 - 0.9 * step / 100
-        ended |= reached
-    return float(returns.mean())
-
-
 @pytest.mark.slow
 def test_policy_learning_in_the_true_dynamics_solves_the_maze():
     """The second instrument of the study: the same actor, critic and returns, with nothing to blame on the model."""
-    args = method.complete_args(method.Args(actor_learning_rate=1e-3))
-    torch.manual_seed(0)
-    learner, maze = method.Learner(args, Rooms(), CPU), method.maze(11)
-    cells = np.flatnonzero(maze.rooms < 4)
-    for _ in range(6_000):
-        pose, goal = (
-            torch.randint(4 * len(maze.cells), (128,)),
-            torch.from_numpy(cells)[torch.randint(len(cells), (128,))],
-        )
-        goal = torch.where(pose // 4 == goal, torch.tensor(cells[0]), goal)
-        learner.learn_behaviour(RoomState(pose, goal))
-    value = true_return(learner.behaviour)
-    assert value >= 0.85, value
+    returns = dreamer_true.learn(starts=64, horizon=15, updates=6_000, seed=1)
+    assert returns[-1] >= 0.85, returns
 
 
 # Runs
