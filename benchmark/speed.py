@@ -7,7 +7,7 @@
     python benchmark/speed.py torcs                                # the simulator alone, and DDPG on it; about 12 minutes
     python benchmark/speed.py gail                                 # GAIL beside TRPO without it; about 3 minutes
     python benchmark/speed.py rooms                                # FourRooms beside MiniGrid; about a minute
-    python benchmark/speed.py dreamer                              # a Dreamer's gradient step and its parts; about 8 minutes
+    python benchmark/speed.py dreamer                              # a Dreamer's gradient step and its parts; about 15 minutes
 
 Writes `benchmark/results/speed/{ppo_k10,ppo_k80,apple,gopher,torcs,gail,rooms,dreamer}.json` and `.md`: the median of each contender and of its ratios to
 the peer, round by round, with their range. The ratios are the result: the machine's own speed drifts.
@@ -259,10 +259,10 @@ def time_rooms(args: Args) -> None:
 
 
 DREAMERS = {  # rows of the result: script, size, the contenders' flags, of which the first is the plain form
-    "xs": ("dreamer_v2", "xs", ["", "--bf16"]),
+    "xs": ("dreamer_v2", "xs", ["", "--bf16", "--compile"]),
     "m: deter 200, CNN of depth 16, 16 × 50": ("dreamer_v2", "m", ["", "--bf16"]),
-    "xs, HWM Dreamer": ("hwm_dreamer", "xs", ["", "--bf16"]),
-    "xs, HWM HRL Dreamer": ("hwm_hrl_dreamer", "xs", ["", "--bf16"]),
+    "xs, HWM Dreamer": ("hwm_dreamer", "xs", ["", "--bf16", "--compile"]),
+    "xs, HWM HRL Dreamer": ("hwm_hrl_dreamer", "xs", ["", "--bf16", "--compile"]),
 }
 
 
