@@ -31,7 +31,7 @@ CAUSES = {  # the baseline, and what it does without one of the things that it n
     "dreamer": AGENTS["dreamer"],
     "dreamer_sharp": ("codes may get sharp (--entropy-scale 0)", "dreamer_v2", "tab:red"),
     "dreamer_slow": ("the model's rate is 1e-3", "dreamer_v2", "tab:orange"),
-    "dreamer_early": ("50,000 steps of random play at first", "dreamer_v2", "tab:brown"),
+    "dreamer_early": ("200,000 steps of random play at first", "dreamer_v2", "tab:brown"),
     "dreamer_uniform": ("chunks from anywhere (--rewarded-share 0)", "dreamer_v2", "tab:gray"),
     "dreamer_eps": ("Adam's ε is 1e-5", "dreamer_v2", "black"),
 }

@@ -2,7 +2,7 @@
 # Dreamer, HWM Dreamer and HWM HRL Dreamer in FourRooms, and both HWM agents with segments of a fixed length; and dreamer_*, the
 # baseline without one of the things that it needs: the runs behind benchmark/results/dreamer/. Can be sent again after every stop.
 #   benchmark/fourrooms.sh
-#   STEPS=300000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 300,000 steps
+#   STEPS=600000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 600,000 steps
 #   AGENTS="dreamer_sharp dreamer_slow dreamer_early dreamer_uniform dreamer_eps" SEEDS="1 2" benchmark/fourrooms.sh
 #   SIZE=thesis FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh
 #   KNOWN=benchmark/results/dreamer/xs benchmark/fourrooms.sh    the report goes on from an earlier one whose run folders are gone
@@ -16,7 +16,7 @@ script() {  # AGENT: its file and its own flags
     dreamer) echo dreamer_v2.py ;;
     dreamer_sharp) echo dreamer_v2.py --entropy-scale 0 ;;
     dreamer_slow) echo dreamer_v2.py --model-learning-rate 1e-3 ;;
-    dreamer_early) echo dreamer_v2.py --prefill 50000 ;;
+    dreamer_early) echo dreamer_v2.py --prefill 200000 ;;
     dreamer_uniform) echo dreamer_v2.py --rewarded-share 0 ;;
     dreamer_eps) echo dreamer_v2.py --adam-eps 1e-5 ;;
     hwm) echo hwm_dreamer.py ;;

@@ -123,7 +123,7 @@ class Args:
     """environment steps"""
     num_envs: int = 10
     """games side by side"""
-    prefill: int = 200_000
+    prefill: int = 500_000
     """first environment steps, of random play, without updates"""
     train_frequency: int = 5
     """environment steps per update"""
