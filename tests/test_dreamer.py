@@ -15,6 +15,7 @@ from conftest import ROOT, kill_twice, needs_compiler, run
 from cleanrl_thesis import dreamer_v2 as method
 
 sys.path.append(str(ROOT / "benchmark"))
+import dreamer_goals  # noqa: E402
 import dreamer_report  # noqa: E402
 import dreamer_true  # noqa: E402
 
@@ -366,6 +367,22 @@ def test_critic_and_actor_on_a_chain():
     assert (policy[:, 1] > 0.95).all(), policy
 
 
+def test_random_play_at_first_holds_a_reward_at_nearly_every_goal(tmp_path):
+    """A goal at which nothing was ever paid is never sought."""
+    args = method.complete_args(method.Args(num_envs=100, total_timesteps=600_000))
+    torch.manual_seed(0)
+    replay = method.Replay(tmp_path / "replay.dat", args)
+    model = method.WorldModel(args, 3)
+    collector = method.Collector(args, replay, method.Player(method.Learner(args, model, CPU), args.num_envs))
+    collector.reset()
+    for _ in range(args.prefill // args.num_envs):
+        collector.step(randomly=True)
+    rewards, maze = dreamer_goals.rewards_at_goals(replay, 68), method.maze(11)
+    assert rewards.sum() == sum((row["reward"] > 0).sum() for row in replay.rows) > 200
+    assert not rewards[maze.rooms >= 4].any()
+    assert (rewards[maze.rooms < 4] > 0).sum() >= 58  # of 64
+
+
 @pytest.mark.slow
 def test_policy_learning_in_the_true_dynamics_solves_the_maze():
     """The second instrument of the study: the same actor, critic and returns, with nothing to blame on the model."""
@@ -617,6 +634,18 @@ def test_steps_to_a_return_and_curves(tmp_path):
     )
     with pytest.raises(SystemExit, match="--known .*: cannot be read"):
         dreamer_report.read_known(tmp_path)
+
+
+def test_goals_by_what_the_replay_paid(small_run, capsys):
+    dreamer_goals.main(dreamer_goals.Args(small_run, episodes=50))
+    lines = capsys.readouterr().out.splitlines()
+    rewards = int(lines[0].split()[-2])
+    episodes = np.genfromtxt(small_run / "episodes.csv", delimiter=",", names=True)
+    assert rewards == (episodes["episodic_return"] > 0).sum()
+    cells, played = (sum(int(line.split("|")[column]) for line in lines[3:]) for column in (2, 3))
+    assert cells == 64 and played == 50
+    with pytest.raises(SystemExit, match="no checkpoint"):
+        dreamer_goals.main(dreamer_goals.Args(small_run.parent))
 
 
 def test_moving_mean():
