@@ -32,6 +32,7 @@ CAUSES = {  # the baseline, and what it does without one of the things that it n
     "dreamer_sharp": ("codes may get sharp (--entropy-scale 0)", "dreamer_v2", "tab:red"),
     "dreamer_slow": ("the model's rate is 1e-3", "dreamer_v2", "tab:orange"),
     "dreamer_early": ("200,000 steps of random play at first", "dreamer_v2", "tab:brown"),
+    "dreamer_far": ("γ is 0.99", "dreamer_v2", "tab:cyan"),
     "dreamer_uniform": ("chunks from anywhere (--rewarded-share 0)", "dreamer_v2", "tab:gray"),
     "dreamer_eps": ("Adam's ε is 1e-5", "dreamer_v2", "black"),
 }

@@ -3,7 +3,7 @@
 # baseline without one of the things that it needs: the runs behind benchmark/results/dreamer/. Can be sent again after every stop.
 #   benchmark/fourrooms.sh
 #   STEPS=600000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 600,000 steps
-#   AGENTS="dreamer_sharp dreamer_slow dreamer_early dreamer_uniform dreamer_eps" SEEDS="1 2" benchmark/fourrooms.sh
+#   AGENTS="dreamer_sharp dreamer_slow dreamer_early dreamer_far dreamer_uniform dreamer_eps" SEEDS="1 2" benchmark/fourrooms.sh
 #   SIZE=thesis FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh
 #   KNOWN=benchmark/results/dreamer/xs benchmark/fourrooms.sh    the report goes on from an earlier one whose run folders are gone
 set -euo pipefail
@@ -17,13 +17,14 @@ script() {  # AGENT: its file and its own flags
     dreamer_sharp) echo dreamer_v2.py --entropy-scale 0 ;;
     dreamer_slow) echo dreamer_v2.py --model-learning-rate 1e-3 ;;
     dreamer_early) echo dreamer_v2.py --prefill 200000 ;;
+    dreamer_far) echo dreamer_v2.py --gamma 0.99 ;;
     dreamer_uniform) echo dreamer_v2.py --rewarded-share 0 ;;
     dreamer_eps) echo dreamer_v2.py --adam-eps 1e-5 ;;
     hwm) echo hwm_dreamer.py ;;
     hrl) echo hwm_hrl_dreamer.py ;;
     hwm_fixed) echo hwm_dreamer.py --fixed-interval "$INTERVAL" ;;
     hrl_fixed) echo hwm_hrl_dreamer.py --fixed-interval "$INTERVAL" ;;
-    *) echo "AGENTS=$AGENTS: must be of dreamer, hwm, hrl, hwm_fixed, hrl_fixed, dreamer_{sharp,slow,early,uniform,eps}" >&2; exit 2 ;;
+    *) echo "AGENTS=$AGENTS: must be of dreamer, hwm, hrl, hwm_fixed, hrl_fixed, dreamer_{sharp,slow,early,far,uniform,eps}" >&2; exit 2 ;;
   esac
 }
 for agent in $AGENTS; do script "$agent" >/dev/null; done

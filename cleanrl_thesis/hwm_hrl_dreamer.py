@@ -239,7 +239,7 @@ SIZES = {  # features are as many as the baseline's
     "xs": {"encoder": "tiles", "frame_side": 22, "depth": 16, "deter_z": 128, "stoch_z": 4, "deter_w": 128}
     | {"stoch_w": 20, "classes": 16}
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
-    | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 64, "gamma": 0.99, "image_scale": 0.25}
+    | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 64, "gamma": 0.95, "image_scale": 0.25}
     | {"kl_z_scale": 1.0, "kl_w_scale": 1.0, "kl_warmup": 1_000, "entropy_scale": 0.3}
     | {"reward_scale": 10.0, "tanh_reward": False}
     | {"model_learning_rate": 3e-3, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
