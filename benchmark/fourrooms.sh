@@ -2,7 +2,7 @@
 # Dreamer, HWM Dreamer and HWM HRL Dreamer in FourRooms, and both HWM agents with segments of a fixed length; and dreamer_*, the
 # baseline without one of the things that it needs: the runs behind benchmark/results/dreamer/. Can be sent again after every stop.
 #   benchmark/fourrooms.sh
-#   STEPS=600000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 600,000 steps
+#   STEPS=1100000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 1,100,000 steps
 #   AGENTS="dreamer_sharp dreamer_slow dreamer_early dreamer_far dreamer_uniform dreamer_eps" SEEDS="1 2" benchmark/fourrooms.sh
 #   SIZE=thesis FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh
 #   KNOWN=benchmark/results/dreamer/xs benchmark/fourrooms.sh    the report goes on from an earlier one whose run folders are gone

@@ -17,7 +17,7 @@ sampled. `--run-dir DIR --resume` can be sent again after every crash: on the sa
 | batches | 16 × 50, all states start a dream | 24 × 10, 64 states start one |
 | γ | 0.999 | 0.95: the frame does not show the time that a reward depends on, so only γ makes the agent hurry; at 0.99 a wrong value lives long, for states that see no reward learn it from each other |
 | Adam's ε | 1e-5 | 1e-8 for actor and critic: their gradients are so small that 1e-5 stalls them |
-| random play at first | not said | 500,000 steps, with a reward in all but 2 of 64 goal cells; after 200,000 there are 16 without one, which are never sought |
+| random play at first | not said | 1,000,000 steps, with a reward or more at each of 64 goal cells; after 200,000 there are 16 without one, which are never sought |
 | rates | 2e-4, 4e-5, 1e-4 | 3e-3 for the model (at 1e-3 it needs five times the updates), 1e-3 for actor and critic |
 | rewards | tanh, weight 1 | as they are, weight 10 |
 | layers | SiLU, where the thesis has ELU: twice as fast on large batches | the same, normalised in the heads |
@@ -125,7 +125,7 @@ class Args:
     """environment steps"""
     num_envs: int = 10
     """games side by side"""
-    prefill: int = 500_000
+    prefill: int = 1_000_000
     """first environment steps, of random play, without updates"""
     train_frequency: int = 5
     """environment steps per update"""

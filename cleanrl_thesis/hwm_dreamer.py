@@ -123,7 +123,7 @@ class Args:
     """environment steps"""
     num_envs: int = 10
     """games side by side"""
-    prefill: int = 500_000
+    prefill: int = 1_000_000
     """first environment steps, of random play, without updates"""
     train_frequency: int = 5
     """environment steps per update"""

@@ -369,7 +369,7 @@ def test_critic_and_actor_on_a_chain():
 
 def test_random_play_at_first_holds_a_reward_at_nearly_every_goal(tmp_path):
     """A goal at which nothing was ever paid is never sought."""
-    args = method.complete_args(method.Args(num_envs=100, total_timesteps=600_000))
+    args = method.complete_args(method.Args(num_envs=100, total_timesteps=1_100_000))
     torch.manual_seed(0)
     replay = method.Replay(tmp_path / "replay.dat", args)
     model = method.WorldModel(args, 3)
@@ -378,9 +378,9 @@ def test_random_play_at_first_holds_a_reward_at_nearly_every_goal(tmp_path):
     for _ in range(args.prefill // args.num_envs):
         collector.step(randomly=True)
     rewards, maze = dreamer_goals.rewards_at_goals(replay, 68), method.maze(11)
-    assert rewards.sum() == sum((row["reward"] > 0).sum() for row in replay.rows) > 200
+    assert rewards.sum() == sum((row["reward"] > 0).sum() for row in replay.rows) > 400
     assert not rewards[maze.rooms >= 4].any()
-    assert (rewards[maze.rooms < 4] > 0).sum() >= 58  # of 64
+    assert (rewards[maze.rooms < 4] > 0).sum() >= 62  # of 64
 
 
 @pytest.mark.slow
