@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import tyro
 
-GROUPS = ((0, 0), (1, 2), (3, 9), (10, 10**9))  # rewards at a goal's cell, both ends included
+GROUPS = {"0": (0, 0), "1 to 2": (1, 2), "3 to 9": (3, 9), "10 and more": (10, 10**9)}  # rewards at a goal's cell
 
 
 @dataclass
@@ -61,13 +61,10 @@ def main(args: Args) -> None:
     goals, possible = played["starts"][:, 2], np.unique(maze.starts[:, 1])
     print(f"{args.run}: {replay.lengths.sum():,} records, {rewards.sum():,} rewards")
     print("| rewards at the goal's cell | cells | episodes | reached | return |\n|---|---|---|---|---|")
-    for least, most in GROUPS:
+    for name, (least, most) in GROUPS.items():
         cells = possible[(rewards[possible] >= least) & (rewards[possible] <= most)]
         ours = np.isin(goals, cells)
         if ours.any():
-            name = (
-                f"{least} to {most}" if least < most < 10**9 else f"{least}" if least == most else f"{least} and more"
-            )
             reached, mean = played["solved"][ours].mean(), played["returns"][ours].mean()
             print(f"| {name} | {len(cells)} | {ours.sum()} | {reached:.2f} | {mean:.3f} |")
 
