@@ -99,7 +99,7 @@ class Cluster:
         self.start("slurmctld", "-D")
         for node in ("one", "two"):
             self.start_node(node)
-        wait_until(lambda: self.ask("sinfo", "--noheader", "--format=%T").split() == ["idle"], 60, "two idle nodes")
+        self.wait_for_idle_nodes()
 
     def start(self, *words: str, name: str = "") -> None:
         with open(self.folder / "daemons.log", "ab") as log:
@@ -108,6 +108,9 @@ class Cluster:
 
     def start_node(self, node: str) -> None:
         self.start("slurmd", "-D", "-N", node, name=node)
+
+    def wait_for_idle_nodes(self) -> None:
+        wait_until(lambda: self.ask("sinfo", "--noheader", "--format=%T").split() == ["idle"], 60, "two idle nodes")
 
     def ask(self, *words: str) -> str:
         return subprocess.run(words, env=self.environment, capture_output=True, text=True).stdout
@@ -181,8 +184,9 @@ def test_a_sweep_survives_the_death_of_a_node_and_a_warning(cluster, tmp_path):
     cluster.kill_node("one")
     cluster.ask("scancel", "--batch", "--signal=USR1", on_two)  # Slurm itself looks at time limits twice a minute only
     wait_until(lambda: "down" in cluster.ask("sinfo", "--noheader", "--format=%T"), 60, "the dead node is found")
-    cluster.start_node("one")
     wait_until(lambda: not cluster.ask("squeue", "--noheader"), 400, "an empty queue")
+    cluster.start_node("one")  # only now: the controller still sends it a kill, which would meet the next attempt
+    cluster.wait_for_idle_nodes()
 
     for folder in sorted((tmp_path / "runs").glob("*__seed*")):
         assert_same_run(whole / folder.name[-1], folder)
