@@ -205,29 +205,15 @@ class Args:
 SIZES = {
     "xs": {"encoder": "tiles", "frame_side": 22, "depth": 16, "deter": 128, "stoch": 16, "classes": 32}
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
-    | {
-        "batch_size": 24,
-        "chunk_length": 10,
-        "rewarded_share": 0.1,
-        "starts": 64,
-        "gamma": 0.95,
-        "image_scale": 0.25,
-        "kl_scale": 1.0,
-    }
+    | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 64, "gamma": 0.95}
+    | {"image_scale": 0.25, "kl_scale": 1.0}
     | {"kl_warmup": 1_000, "entropy_scale": 0.3, "reward_scale": 10.0, "tanh_reward": False}
     | {"model_learning_rate": 3e-3, "adam_eps": 1e-8}
     | {"actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3, "ent_coef": 3e-3},
     "thesis": {"encoder": "cnn", "frame_side": 64, "depth": 48, "deter": 600, "stoch": 32, "classes": 32}
     | {"hidden_size": 600, "head_size": 400, "head_layers": 4, "head_norm": False}
-    | {
-        "batch_size": 16,
-        "chunk_length": 50,
-        "rewarded_share": 0.0,
-        "starts": 800,
-        "gamma": 0.999,
-        "image_scale": 1.0,
-        "kl_scale": 0.1,
-    }
+    | {"batch_size": 16, "chunk_length": 50, "rewarded_share": 0.0, "starts": 800, "gamma": 0.999}
+    | {"image_scale": 1.0, "kl_scale": 0.1}
     | {"kl_warmup": 0, "entropy_scale": 0.0, "reward_scale": 1.0, "tanh_reward": True}
     | {"model_learning_rate": 2e-4, "adam_eps": 1e-5}
     | {"actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4, "ent_coef": 1e-3},
@@ -286,21 +272,12 @@ def complete_args(args: Args) -> Args:
         ("gamma gae_lambda kl_balance rewarded_share", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("kl_warmup", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
-        (
-            "prefill",
-            lambda x: x >= BLOCK and x % BLOCK == 0,
-            f"must be a multiple of {BLOCK}, for whole rows of updates.csv",
-        ),
-        ("total_timesteps", lambda x: x >= BLOCK and x % BLOCK == 0, f"must be a multiple of {BLOCK}"),
+        ("prefill total_timesteps", lambda x: x >= BLOCK and x % BLOCK == 0, f"must be a multiple of {BLOCK}"),
     ):
         for name in names.split():
             require(holds(getattr(args, name)), f"--{name.replace('_', '-')}", getattr(args, name), allowed)
-    require(
-        BLOCK % args.num_envs == 0,
-        "--num-envs",
-        args.num_envs,
-        f"must divide {BLOCK}, the steps of a row of updates.csv",
-    )
+    divides = BLOCK % args.num_envs == 0
+    require(divides, "--num-envs", args.num_envs, f"must divide {BLOCK}, the steps of a row of updates.csv")
     fits = args.prefill // args.num_envs > args.chunk_length
     require(fits, "--prefill", args.prefill, "must give each game more steps than --chunk-length")
     more = args.prefill < args.total_timesteps
@@ -492,11 +469,8 @@ class FourRoomsEnv(minigrid.envs.FourRoomsEnv):
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
 
     def __init__(self, size: int = 11, side: int = 64, render_mode: str | None = None):
-        self.games, self.game = (
-            FourRoomsGames(size, 1),
-            np.zeros(1, np.intp),
-        )  # where episodes begin, and the state as numbers
-        self.painter = painter(size, side)
+        self.games = FourRoomsGames(size, 1)  # where episodes begin, and the state as numbers
+        self.game, self.painter = np.zeros(1, np.intp), painter(size, side)
         mission = MissionSpace(mission_func=self._gen_mission)
         options = {"max_steps": MAX_STEPS, "render_mode": render_mode, "highlight": False}
         MiniGridEnv.__init__(self, mission, width=size, height=size, **options)
@@ -545,11 +519,8 @@ class FourRoomsVectorEnv(gym.vector.VectorEnv):
         self.single_observation_space, self.single_action_space = room_frames(side), ROOM_ACTIONS
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(ROOM_ACTIONS, num_envs)
-        self.games, self.all_games, self.painter = (
-            FourRoomsGames(size, num_envs),
-            np.arange(num_envs),
-            painter(size, side),
-        )
+        self.games, self.all_games = FourRoomsGames(size, num_envs), np.arange(num_envs)
+        self.painter = painter(size, side)
         self.seed_games(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_games(self, seeds: list[int]) -> None:
@@ -664,10 +635,8 @@ class Replay:
             winners, numbers = draw_from_rows(counts, rewarded)
             ends = np.array([self.rewarded[game][number] for game, number in zip(winners, numbers)])
             begin = ends - torch.randint(args.chunk_length, (rewarded,)).numpy()
-            games, begins = (
-                np.concatenate([games, winners]),
-                np.concatenate([begins, begin.clip(0, places[winners] - 1)]),
-            )
+            games = np.concatenate([games, winners])
+            begins = np.concatenate([begins, begin.clip(0, places[winners] - 1)])
         return games, begins
 
     def sample(self, device: torch.device) -> Chunks:
@@ -676,15 +645,8 @@ class Replay:
         games, begins = self.places()
         records = self.rows[games, begins + np.arange(args.chunk_length)[:, None]]  # (T, B)
         frames = self.painter.draw(records["pose"].ravel().astype(np.intp), records["goal"].ravel().astype(np.intp))
-        actions, first, rewards, terminals = (
-            records[name].astype(kind)
-            for name, kind in (
-                ("action", np.int64),
-                ("first", np.float32),
-                ("reward", np.float32),
-                ("terminal", np.float32),
-            )
-        )
+        actions = records["action"].astype(np.int64)
+        first, rewards, terminals = (records[name].astype(np.float32) for name in ("first", "reward", "terminal"))
         first[0] = 1
         arrays = frames.reshape(*records.shape, *frames.shape[1:]), actions, first, rewards, terminals
         return Chunks(*(torch.from_numpy(array).to(device) for array in arrays))
@@ -798,9 +760,8 @@ def uniforms(*shape: int, device: torch.device) -> torch.Tensor:
 def one_hot_sample(logits: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
     """A one-hot draw from the softmax of logits (..., C), by one uniform number for each (...): the inverse of its distribution."""
     below = logits.detach().softmax(-1).cumsum(-1)
-    index = torch.searchsorted(below, uniform[..., None] * below[..., -1:]).clamp(
-        max=logits.shape[-1] - 1
-    )  # nan: the last
+    index = torch.searchsorted(below, uniform[..., None] * below[..., -1:])
+    index = index.clamp(max=logits.shape[-1] - 1)  # nan: the last
     return torch.zeros_like(below).scatter_(-1, index, 1.0)
 
 
@@ -1242,11 +1203,8 @@ class Collector:
 
     def __init__(self, args: Args, replay: Replay, player: Player):
         self.args, self.replay, self.player = args, replay, player
-        self.envs, self.games = (
-            FourRoomsVectorEnv(args.num_envs, ROOM_SIZES[args.env_id], args.frame_side),
-            np.arange(args.num_envs),
-        )
-        self.begins = np.ones(args.num_envs, bool)
+        self.envs = FourRoomsVectorEnv(args.num_envs, ROOM_SIZES[args.env_id], args.frame_side)
+        self.games, self.begins = np.arange(args.num_envs), np.ones(args.num_envs, bool)
 
     def reset(self) -> None:
         """Begin the first episodes."""
@@ -1746,9 +1704,8 @@ def main(args: Args) -> int:
         torch.set_rng_state(checkpoint["torch_rng"])
     else:
         collector.reset()
-    arithmetic = (
-        f"{'compiled' if is_compiled else 'plain'}, {'bfloat16' if learner.bf16 else 'float32'} on {device.type}"
-    )
+    numbers = "bfloat16" if learner.bf16 else "float32"
+    arithmetic = f"{'compiled' if is_compiled else 'plain'}, {numbers} on {device.type}"
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
@@ -1771,11 +1728,8 @@ def main(args: Args) -> int:
         progress.update(BLOCK)
         if metrics:
             is_due = global_step % COMPARISON == 0
-            compared = (
-                compare_dream(learner, args)
-                if is_due
-                else {"eval/real_return": math.nan, "eval/dreamed_return": math.nan}
-            )
+            unknown = {"eval/real_return": math.nan, "eval/dreamed_return": math.nan}
+            compared = compare_dream(learner, args) if is_due else unknown
             metrics = {"charts/episodic_return": returns, **metrics, **compared}
             updates_csv.write({"global_step": global_step, **metrics})
             if not all(math.isfinite(value) for name, value in metrics.items() if name.startswith("losses/")):

@@ -312,21 +312,12 @@ def complete_args(args: Args) -> Args:
         ("std_bias read_bias", math.isfinite, "must be finite"),
         ("fixed_interval kl_warmup", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
-        (
-            "prefill",
-            lambda x: x >= BLOCK and x % BLOCK == 0,
-            f"must be a multiple of {BLOCK}, for whole rows of updates.csv",
-        ),
-        ("total_timesteps", lambda x: x >= BLOCK and x % BLOCK == 0, f"must be a multiple of {BLOCK}"),
+        ("prefill total_timesteps", lambda x: x >= BLOCK and x % BLOCK == 0, f"must be a multiple of {BLOCK}"),
     ):
         for name in names.split():
             require(holds(getattr(args, name)), f"--{name.replace('_', '-')}", getattr(args, name), allowed)
-    require(
-        BLOCK % args.num_envs == 0,
-        "--num-envs",
-        args.num_envs,
-        f"must divide {BLOCK}, the steps of a row of updates.csv",
-    )
+    divides = BLOCK % args.num_envs == 0
+    require(divides, "--num-envs", args.num_envs, f"must divide {BLOCK}, the steps of a row of updates.csv")
     fits = args.prefill // args.num_envs > args.chunk_length
     require(fits, "--prefill", args.prefill, "must give each game more steps than --chunk-length")
     allowed = f"must be less than --chunk-length {args.chunk_length}, or no chunk would hold a segment's end"
@@ -520,11 +511,8 @@ class FourRoomsEnv(minigrid.envs.FourRoomsEnv):
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
 
     def __init__(self, size: int = 11, side: int = 64, render_mode: str | None = None):
-        self.games, self.game = (
-            FourRoomsGames(size, 1),
-            np.zeros(1, np.intp),
-        )  # where episodes begin, and the state as numbers
-        self.painter = painter(size, side)
+        self.games = FourRoomsGames(size, 1)  # where episodes begin, and the state as numbers
+        self.game, self.painter = np.zeros(1, np.intp), painter(size, side)
         mission = MissionSpace(mission_func=self._gen_mission)
         options = {"max_steps": MAX_STEPS, "render_mode": render_mode, "highlight": False}
         MiniGridEnv.__init__(self, mission, width=size, height=size, **options)
@@ -573,11 +561,8 @@ class FourRoomsVectorEnv(gym.vector.VectorEnv):
         self.single_observation_space, self.single_action_space = room_frames(side), ROOM_ACTIONS
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(ROOM_ACTIONS, num_envs)
-        self.games, self.all_games, self.painter = (
-            FourRoomsGames(size, num_envs),
-            np.arange(num_envs),
-            painter(size, side),
-        )
+        self.games, self.all_games = FourRoomsGames(size, num_envs), np.arange(num_envs)
+        self.painter = painter(size, side)
         self.seed_games(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_games(self, seeds: list[int]) -> None:
@@ -692,10 +677,8 @@ class Replay:
             winners, numbers = draw_from_rows(counts, rewarded)
             ends = np.array([self.rewarded[game][number] for game, number in zip(winners, numbers)])
             begin = ends - torch.randint(args.chunk_length, (rewarded,)).numpy()
-            games, begins = (
-                np.concatenate([games, winners]),
-                np.concatenate([begins, begin.clip(0, places[winners] - 1)]),
-            )
+            games = np.concatenate([games, winners])
+            begins = np.concatenate([begins, begin.clip(0, places[winners] - 1)])
         return games, begins
 
     def sample(self, device: torch.device) -> Chunks:
@@ -704,15 +687,8 @@ class Replay:
         games, begins = self.places()
         records = self.rows[games, begins + np.arange(args.chunk_length)[:, None]]  # (T, B)
         frames = self.painter.draw(records["pose"].ravel().astype(np.intp), records["goal"].ravel().astype(np.intp))
-        actions, first, rewards, terminals = (
-            records[name].astype(kind)
-            for name, kind in (
-                ("action", np.int64),
-                ("first", np.float32),
-                ("reward", np.float32),
-                ("terminal", np.float32),
-            )
-        )
+        actions = records["action"].astype(np.int64)
+        first, rewards, terminals = (records[name].astype(np.float32) for name in ("first", "reward", "terminal"))
         first[0] = 1
         arrays = frames.reshape(*records.shape, *frames.shape[1:]), actions, first, rewards, terminals
         return Chunks(*(torch.from_numpy(array).to(device) for array in arrays))
@@ -826,9 +802,8 @@ def uniforms(*shape: int, device: torch.device) -> torch.Tensor:
 def one_hot_sample(logits: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
     """A one-hot draw from the softmax of logits (..., C), by one uniform number for each (...): the inverse of its distribution."""
     below = logits.detach().softmax(-1).cumsum(-1)
-    index = torch.searchsorted(below, uniform[..., None] * below[..., -1:]).clamp(
-        max=logits.shape[-1] - 1
-    )  # nan: the last
+    index = torch.searchsorted(below, uniform[..., None] * below[..., -1:])
+    index = index.clamp(max=logits.shape[-1] - 1)  # nan: the last
     return torch.zeros_like(below).scatter_(-1, index, 1.0)
 
 
@@ -1098,10 +1073,8 @@ class HWM(nn.Module):
         for t in range(len(embed)):
             begins = first[t, :, None]
             if self.args.fixed_interval:
-                read, force = (
-                    torch.maximum(begins, (state.age + 1 >= self.args.fixed_interval).float()),
-                    torch.ones_like(begins),
-                )
+                read = torch.maximum(begins, (state.age + 1 >= self.args.fixed_interval).float())
+                force = torch.ones_like(begins)
             else:
                 read, force = begins + (1 - begins) * (m[t - 1, :, None] if t else 0), begins
             state = Belief(*((1 - begins) * part for part in state))
@@ -1309,10 +1282,8 @@ def behaviour_loss(
     """
     features, skills = dream.features[:-1], dream.skills[:-1]
     with torch.no_grad():
-        values, high_values = (
-            behaviour.slow_value(dream.features, dream.skills),
-            behaviour.slow_high_value(dream.features),
-        )
+        values = behaviour.slow_value(dream.features, dream.skills)
+        high_values = behaviour.slow_high_value(dream.features)
         returns = lambda_return(dream.rewards, dream.discounts, values, gae_lambda)
         high_returns = high_return(dream.rewards, dream.discounts, dream.decides, high_values, values[-1], gae_lambda)
         weights, decides = dream_weights(dream.discounts), dream.decides[:-1] > 0
@@ -1538,11 +1509,8 @@ class Collector:
 
     def __init__(self, args: Args, replay: Replay, player: Player):
         self.args, self.replay, self.player = args, replay, player
-        self.envs, self.games = (
-            FourRoomsVectorEnv(args.num_envs, ROOM_SIZES[args.env_id], args.frame_side),
-            np.arange(args.num_envs),
-        )
-        self.begins = np.ones(args.num_envs, bool)
+        self.envs = FourRoomsVectorEnv(args.num_envs, ROOM_SIZES[args.env_id], args.frame_side)
+        self.games, self.begins = np.arange(args.num_envs), np.ones(args.num_envs, bool)
 
     def reset(self) -> None:
         """Begin the first episodes."""
@@ -2044,9 +2012,8 @@ def main(args: Args) -> int:
         torch.set_rng_state(checkpoint["torch_rng"])
     else:
         collector.reset()
-    arithmetic = (
-        f"{'compiled' if is_compiled else 'plain'}, {'bfloat16' if learner.bf16 else 'float32'} on {device.type}"
-    )
+    numbers = "bfloat16" if learner.bf16 else "float32"
+    arithmetic = f"{'compiled' if is_compiled else 'plain'}, {numbers} on {device.type}"
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
@@ -2069,11 +2036,8 @@ def main(args: Args) -> int:
         progress.update(BLOCK)
         if metrics:
             is_due = global_step % COMPARISON == 0
-            compared = (
-                compare_dream(learner, args)
-                if is_due
-                else {"eval/real_return": math.nan, "eval/dreamed_return": math.nan}
-            )
+            unknown = {"eval/real_return": math.nan, "eval/dreamed_return": math.nan}
+            compared = compare_dream(learner, args) if is_due else unknown
             metrics = {"charts/episodic_return": returns, **metrics, **compared}
             updates_csv.write({"global_step": global_step, **metrics})
             if not all(math.isfinite(value) for name, value in metrics.items() if name.startswith("losses/")):

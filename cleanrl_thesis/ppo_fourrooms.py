@@ -402,11 +402,8 @@ class FourRoomsEnv(minigrid.envs.FourRoomsEnv):
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
 
     def __init__(self, size: int = 11, side: int = 64, render_mode: str | None = None):
-        self.games, self.game = (
-            FourRoomsGames(size, 1),
-            np.zeros(1, np.intp),
-        )  # where episodes begin, and the state as numbers
-        self.painter = painter(size, side)
+        self.games = FourRoomsGames(size, 1)  # where episodes begin, and the state as numbers
+        self.game, self.painter = np.zeros(1, np.intp), painter(size, side)
         mission = MissionSpace(mission_func=self._gen_mission)
         options = {"max_steps": MAX_STEPS, "render_mode": render_mode, "highlight": False}
         MiniGridEnv.__init__(self, mission, width=size, height=size, **options)
@@ -455,11 +452,8 @@ class FourRoomsVectorEnv(gym.vector.VectorEnv):
         self.single_observation_space, self.single_action_space = room_frames(side), ROOM_ACTIONS
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gym.vector.utils.batch_space(ROOM_ACTIONS, num_envs)
-        self.games, self.all_games, self.painter = (
-            FourRoomsGames(size, num_envs),
-            np.arange(num_envs),
-            painter(size, side),
-        )
+        self.games, self.all_games = FourRoomsGames(size, num_envs), np.arange(num_envs)
+        self.painter = painter(size, side)
         self.seed_games(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_games(self, seeds: list[int]) -> None:

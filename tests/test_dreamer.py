@@ -458,6 +458,16 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path, torn, stop
 
 
 @needs_compiler
+@pytest.mark.slow
+def test_a_compiled_run_goes_on_to_the_same_bytes(tmp_path):
+    flags = [*SMALL, "--compile"]
+    run(*flags, "--run-dir", "whole", cwd=tmp_path, script=SCRIPT)
+    run(*flags, "--run-dir", "run", "--stop-at", 1000, cwd=tmp_path, script=SCRIPT)
+    run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    assert_same_states(tmp_path / "whole", tmp_path / "run")
+
+
+@needs_compiler
 def test_compiled_and_plain_agree(tmp_path):
     """The same batch, the same draws: parts of the losses, and parameters after three updates."""
     results = []
