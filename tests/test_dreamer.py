@@ -16,6 +16,7 @@ from cleanrl_thesis import dreamer_v2 as method
 
 sys.path.append(str(ROOT / "benchmark"))
 import dreamer_goals  # noqa: E402
+import dreamer_reads  # noqa: E402
 import dreamer_report  # noqa: E402
 import dreamer_true  # noqa: E402
 
@@ -656,6 +657,8 @@ def test_goals_by_what_the_replay_paid(small_run, capsys):
     assert cells == 64 and played == 50
     with pytest.raises(SystemExit, match="no checkpoint"):
         dreamer_goals.main(dreamer_goals.Args(small_run.parent))
+    with pytest.raises(SystemExit, match="whose model has no segments"):
+        dreamer_reads.main(dreamer_reads.Args(small_run))
 
 
 def test_moving_mean():

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ from test_dreamer import assert_same_states
 
 from cleanrl_thesis import dreamer_v2
 from cleanrl_thesis import hwm_dreamer as method
+
+sys.path.append(str(ROOT / "benchmark"))
+import dreamer_reads  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "hwm_dreamer.py"
 CPU = torch.device("cpu")
@@ -286,6 +290,28 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path):
     for stop_at in (500, 1000, 1500):
         run(*SMALL, "--run-dir", "run", "--resume", "--stop-at", stop_at, cwd=tmp_path, script=SCRIPT)
     assert_same_states(small_run, tmp_path / "run")
+
+
+def test_kinds_of_steps_and_ages():
+    """One game: two walks in room 0, a turn, a bump, into a door and out of it; reads at steps 0, 2 and 5."""
+    rooms, poses = np.array([[0, 0, 0, 0, 0, 4, 1]]).T, 4 * np.array([[0, 1, 2, 2, 2, 9, 12]]).T
+    poses[3:] += 1
+    kinds = dreamer_reads.kinds_of_steps(rooms, poses)
+    steps = {name: np.flatnonzero(mask).tolist() for name, mask in kinds.items()}
+    assert list(steps.values()) == [[1], [5], [6], [2], [3], [4]]
+    assert dreamer_reads.ages(np.array([[1, 0, 1, 0, 0, 1, 0]], bool).T).T.tolist() == [[0, 1, 2, 1, 2, 3, 1]]
+
+
+def test_a_fixed_interval_is_seen_in_play(tmp_path, capsys):
+    """Reads by a run with segments of 4 steps: at age 4 and at no other, as often in one kind of step as in the other."""
+    run(*SMALL, "--fixed-interval", 4, "--stop-at", 1000, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    capsys.readouterr()
+    dreamer_reads.main(dreamer_reads.Args(tmp_path / "run", episodes=20))
+    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[3:]]
+    reads = {name: float(rate) for name, _, rate in rows}
+    assert [name for name in reads if name.startswith("age")] == [f"age {n}" for n in (1, 2, 3, 4)]
+    assert [reads[f"age {n}"] for n in (1, 2, 3, 4)] == [0, 0, 0, 1]
+    assert reads["in a room, turns"] == pytest.approx(0.25, abs=0.05)
 
 
 @pytest.mark.parametrize("flags", [["--fixed-interval", 4], ["--w-reset", "--no-decoder-sees-h"], ["--classes", 1]])
