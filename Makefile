@@ -24,7 +24,7 @@ test: $(VENV)/ready-test
 	$(VENV)/bin/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile
 
 test-slow: $(VENV)/ready-test
-	$(VENV)/bin/python -m pytest -m slow --numprocesses 2 --dist loadfile
+	$(VENV)/bin/python -m pytest -m slow --numprocesses 2 --dist loadfile --durations 20
 
 lint: $(VENV)/ready-test
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check .

@@ -260,7 +260,7 @@ def time_rooms(args: Args) -> None:
 
 DREAMERS = {  # rows of the result: script, size, the contenders' flags, of which the first is the plain form
     "xs": ("dreamer_v2", "xs", ["", "--bf16", "--compile"]),
-    "m: deter 200, CNN of depth 16, 16 × 50": ("dreamer_v2", "m", ["", "--bf16"]),
+    "m: deter 200, CNN of depth 16, 16 × 50": ("dreamer_v2", "m", ["", "--bf16", "--bf16 --compile"]),
     "xs, HWM Dreamer": ("hwm_dreamer", "xs", ["", "--bf16", "--compile"]),
     "xs, HWM HRL Dreamer": ("hwm_hrl_dreamer", "xs", ["", "--bf16", "--compile"]),
 }
