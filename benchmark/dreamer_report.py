@@ -3,8 +3,9 @@
     python benchmark/dreamer_report.py                              # runs/dreamer_xs -> benchmark/results/dreamer/xs
     python benchmark/dreamer_report.py --known DIR                  # with the runs of an earlier report whose folders are gone
 
-Takes whatever part of the runs there is, as far as the shortest of them has come. A run has come to a return when the mean of
-its last 200 episodes is as high. Intervals are 95% t-intervals over seeds.
+Takes whatever part of the runs there is, as far as the shortest of them has come. Steps are counted from the first update, after
+the random play of `--prefill`. A run has come to a return when the mean of its last 200 episodes is as high. Intervals are 95%
+t-intervals over seeds.
 """
 
 import csv
@@ -66,12 +67,12 @@ def steps_to(level: float, steps: np.ndarray, means: np.ndarray) -> float:
 
 
 def read_run(folder: Path) -> dict:
-    """A run's row, and its moving mean over the steps. Columns of the comparison stand where the run has made one."""
+    """A run's row, and its moving mean over the steps with updates. The comparison's columns stand where the run has made one."""
     args = json.loads((folder / "args.json").read_text())
     table = np.loadtxt(folder / "episodes.csv", delimiter=",", skiprows=1, ndmin=2)
-    steps, means = table[:, 0], moving_mean(table[:, 1])
+    steps, means = table[:, 0] - args["prefill"], moving_mean(table[:, 1])
     row = {"agent": re.sub(r"_seed\d+$", "", folder.name), "seed": args["seed"], "size": args["size"]}
-    row |= {"env_id": args["env_id"], "steps": int(steps[-1]), "episodes": len(steps)}
+    row |= {"env_id": args["env_id"], "prefill": args["prefill"], "steps": int(steps[-1]), "episodes": len(steps)}
     row |= {f"steps_to_{level}": steps_to(level, steps, means) for level in LEVELS} | {"last_200": float(means[-1])}
     updates = np.genfromtxt(folder / "updates.csv", delimiter=",", names=True, deletechars="", ndmin=1)
     for name in ("real", "dreamed"):
@@ -81,7 +82,7 @@ def read_run(folder: Path) -> dict:
     ended = json.loads(result.read_text()) if result.exists() else {}
     row |= {name: ended.get(name, "") for name in ("training_seconds", "script_sha256")}
     row["greedy"] = ended["evaluation"]["mean"] if ended else np.nan
-    return {"row": row, "steps": steps, "means": means}
+    return {"row": row, "steps": steps[steps > 0], "means": means[steps > 0]}
 
 
 def cell(text: str) -> float | int | str:
@@ -182,7 +183,7 @@ def curves_figure(runs: list[dict], agents: dict, title: str) -> Figure:
         axes.axhline(level, color="black", linestyle=":", linewidth=0.8)
     row = runs[0]["row"]
     axes.set_title(f"{title}: {row['env_id']}, size {row['size']}; mean of {WINDOW} episodes, range over seeds")
-    axes.set(xlabel="environment steps", ylabel="episodic return", ylim=(0, 1))
+    axes.set(xlabel="environment steps from the first update on", ylabel="episodic return", ylim=(0, 1))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize="small")
@@ -201,10 +202,9 @@ def write_report(runs: list[dict], out: Path) -> None:
     np.savez_compressed(out / "curves.npz", **curves)
     scripts = {((AGENTS | CAUSES)[row["agent"]][1], row["script_sha256"]) for row in rows if row["script_sha256"]}
     made_at = ", ".join(f"{name}.py at {commit_of(name, digest)}" for name, digest in sorted(scripts))
-    text = [
-        f"`benchmark/fourrooms.sh`, {made_at or 'runs that go on'}; this report at {commit()}. One thread each.",
-        "",
-    ]
+    play = " or ".join(f"{steps:,}" for steps in sorted({row["prefill"] for row in rows}, reverse=True))
+    about = f"{made_at or 'runs that go on'}; this report at {commit()}. One thread each. Steps from the first update on, after {play}"
+    text = [f"`benchmark/fourrooms.sh`, {about} of random play.", ""]
     text += table(rows)
     curves_figure(runs, AGENTS, "Fig. 3.5").savefig(out / "fig_3_5.png", dpi=110)
     if any(row["agent"] not in AGENTS for row in rows):

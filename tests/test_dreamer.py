@@ -616,7 +616,7 @@ def test_steps_to_a_return_and_curves(tmp_path):
     ):
         folder = tmp_path / "runs" / name
         folder.mkdir(parents=True)
-        about = {"seed": int(name[-1]), "size": "xs", "env_id": "FourRooms11-v0"}
+        about = {"seed": int(name[-1]), "size": "xs", "env_id": "FourRooms11-v0", "prefill": 2_000}
         (folder / "args.json").write_text(json.dumps(about))
         lines = [f"{10 * (i + 1)},{0.9 if i >= jump else 0.1},10" for i in range(1_000)]
         (folder / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + "\n".join(lines) + "\n")
@@ -624,11 +624,14 @@ def test_steps_to_a_return_and_curves(tmp_path):
         (folder / "updates.csv").write_text(columns + "5000,0.2,0.5\n10000,nan,nan\n")
     runs = dreamer_report.read_runs(tmp_path / "runs")
     rows = {(run["row"]["agent"], run["row"]["seed"]): run["row"] for run in runs}
-    assert rows["dreamer", 1]["steps_to_0.5"] == 10 * (300 + 100) and np.isnan(rows["hwm", 1]["steps_to_0.5"])
-    assert rows["dreamer", 1]["steps_to_0.85"] == 10 * (300 + 188)  # 0.1 + 0.8 · 188 / 200 is the first above 0.85
+    assert rows["dreamer", 1]["steps_to_0.5"] == 10 * (300 + 100) - 2_000 and np.isnan(rows["hwm", 1]["steps_to_0.5"])
+    assert (
+        rows["dreamer", 1]["steps_to_0.85"] == 10 * (300 + 188) - 2_000
+    )  # 0.1 + 0.8 · 188 / 200 is the first above 0.85
+    assert runs[0]["steps"].tolist() == list(range(10, 8_010, 10))
     lines = dreamer_report.table([run["row"] for run in runs])
     assert (
-        lines[2].startswith("| Dreamer | 2 | 5,000 ± 12,706 | ") and "| not reached | not reached | 0.100 |" in lines[3]
+        lines[2].startswith("| Dreamer | 2 | 3,000 ± 12,706 | ") and "| not reached | not reached | 0.100 |" in lines[3]
     )
     assert "| 0.300 ± 0.000 |" in lines[2]
     dreamer_report.write_report(runs, tmp_path / "out")
