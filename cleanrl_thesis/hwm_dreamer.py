@@ -15,7 +15,7 @@ only where a segment begins, w_t with each step. Actor and critic see both, and 
 | end of an episode | not in the model | a discount head, as in the baseline |
 | v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all (`--classes 1`: normal) |
 | Z and W | half of S each | `xs` and `s`: 4 and 20 of 24 variables, for y has to show each frame between two reads (not compared with halves yet) |
-| boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; the agent soon reads z hardly more than once an episode |
+| boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; the agents' reads come to almost none, or to a coin's |
 | the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.7); no read or copy is forced within an episode |
 | faithful model | | `--classes 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0 --kl-m-scale 1` |
 | acting | not said | m from p(m), z from q where it is read, w from q |
