@@ -80,7 +80,7 @@ def main(args: Args) -> None:
     reads, number = played["reads"], np.arange(len(played["reads"]))[:, None]
     there = (number > 0) & (number < played["lasts"])  # steps that the model was free to read at
     later = there & (number > 1)
-    print(f"{args.run}: {played['lasts'].sum():,} steps, {reads[later].mean():.3f} of them read")
+    print(f"{args.run}: {later.sum():,} steps after an episode's second, {reads[later].mean():.3f} of them read")
     print("| step | number | read |\n|---|---|---|")
     age = ages(reads)
     kinds = kinds_of_steps(played["rooms"], played["poses"])

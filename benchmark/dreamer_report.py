@@ -4,8 +4,8 @@
     python benchmark/dreamer_report.py --known DIR                  # with the runs of an earlier report whose folders are gone
 
 Takes whatever part of the runs there is, as far as the shortest of them has come. Steps are counted from the first update, after
-the random play of `--prefill`. A run has come to a return when the mean of its last 200 episodes is as high. Intervals are 95%
-t-intervals over seeds.
+the random play of `--prefill`, whose episodes are in no mean. A run has come to a return when the mean of its last 200 episodes is
+as high; near 0.5 these span some 10,000 steps. Intervals are 95% t-intervals over seeds.
 """
 
 import csv
@@ -37,7 +37,7 @@ CAUSES = {  # the baseline, and what it does without one of the things that it n
     "dreamer_uniform": ("chunks from anywhere (--rewarded-share 0)", "dreamer_v2", "tab:gray"),
     "dreamer_eps": ("Adam's ε is 1e-5", "dreamer_v2", "black"),
 }
-WINDOW = 200  # episodes
+WINDOW, LEAST = 200, 50  # episodes of a moving mean, and of its first point
 BINS = 200  # points of a drawn curve
 POINTS = 1_000  # points of a curve that is kept for later reports
 LEVELS = (0.5, 0.85)  # learning, solved
@@ -66,11 +66,24 @@ def steps_to(level: float, steps: np.ndarray, means: np.ndarray) -> float:
     return float(steps[reached[0]]) if len(reached) else np.nan
 
 
+def learned_episodes(folder: Path, prefill: int) -> tuple[np.ndarray, np.ndarray]:
+    """(steps since the first update, returns) of the episodes that ended since."""
+    table = np.loadtxt(folder / "episodes.csv", delimiter=",", skiprows=1, ndmin=2)
+    table = table[table[:, 0] > prefill]
+    return table[:, 0] - prefill, table[:, 1]
+
+
+def has_curve(folder: Path) -> bool:
+    """Whether as many episodes have ended since the first update as the first mean is of."""
+    prefill = json.loads((folder / "args.json").read_text())["prefill"]
+    return len(learned_episodes(folder, prefill)[0]) >= LEAST
+
+
 def read_run(folder: Path) -> dict:
     """A run's row, and its moving mean over the steps with updates. The comparison's columns stand where the run has made one."""
     args = json.loads((folder / "args.json").read_text())
-    table = np.loadtxt(folder / "episodes.csv", delimiter=",", skiprows=1, ndmin=2)
-    steps, means = table[:, 0] - args["prefill"], moving_mean(table[:, 1])
+    steps, returns = learned_episodes(folder, args["prefill"])
+    means = moving_mean(returns)
     row = {"agent": re.sub(r"_seed\d+$", "", folder.name), "seed": args["seed"], "size": args["size"]}
     row |= {"env_id": args["env_id"], "prefill": args["prefill"], "steps": int(steps[-1]), "episodes": len(steps)}
     row |= {f"steps_to_{level}": steps_to(level, steps, means) for level in LEVELS} | {"last_200": float(means[-1])}
@@ -82,7 +95,7 @@ def read_run(folder: Path) -> dict:
     ended = json.loads(result.read_text()) if result.exists() else {}
     row |= {name: ended.get(name, "") for name in ("training_seconds", "script_sha256")}
     row["greedy"] = ended["evaluation"]["mean"] if ended else np.nan
-    return {"row": row, "steps": steps[steps > 0], "means": means[steps > 0]}
+    return {"row": row, "steps": steps[LEAST - 1 :], "means": means[LEAST - 1 :]}
 
 
 def cell(text: str) -> float | int | str:
@@ -113,12 +126,13 @@ def run_name(row: dict) -> str:
 
 
 def read_runs(folder: Path, known: list[dict] = ()) -> list[dict]:
-    """All runs of known agents that have updates, and those runs of an earlier report that are not among them.
+    """All runs of known agents that have a curve, and those runs of an earlier report that are not among them.
 
     Raises SystemExit where their sizes or tasks differ.
     """
     paths = sorted(path.parent for path in folder.glob("*/updates.csv") if path.stat().st_size)
-    runs = [read_run(path) for path in paths if re.sub(r"_seed\d+$", "", path.name) in AGENTS | CAUSES]
+    paths = [path for path in paths if re.sub(r"_seed\d+$", "", path.name) in AGENTS | CAUSES]
+    runs = [read_run(path) for path in paths if has_curve(path)]
     names = {run_name(run["row"]) for run in runs}
     runs = sorted(
         runs + [run for run in known if run_name(run["row"]) not in names], key=lambda run: run_name(run["row"])
@@ -175,7 +189,7 @@ def curves_figure(runs: list[dict], agents: dict, title: str) -> Figure:
         group = groups[agent]
         if not group:
             continue
-        at = np.linspace(0, min(run["steps"][-1] for run in group), BINS + 1)[1:]
+        at = np.linspace(max(run["steps"][0] for run in group), min(run["steps"][-1] for run in group), BINS)
         curves = np.array([np.interp(at, run["steps"], run["means"]) for run in group])
         axes.plot(at, curves.mean(0), color=colour, label=f"{name}, {len(group)} seed{'s' * (len(group) > 1)}")
         axes.fill_between(at, curves.min(0), curves.max(0), color=colour, alpha=0.15, linewidth=0)

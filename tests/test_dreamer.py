@@ -466,6 +466,7 @@ def test_a_compiled_run_goes_on_to_the_same_bytes(tmp_path):
     run(*flags, "--run-dir", "run", "--stop-at", 1000, cwd=tmp_path, script=SCRIPT)
     run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert_same_states(tmp_path / "whole", tmp_path / "run")
+    assert torch.load(tmp_path / "run" / "checkpoint.pt")["arithmetic"].startswith("compiled")
 
 
 @needs_compiler
@@ -618,7 +619,9 @@ def test_steps_to_a_return_and_curves(tmp_path):
         folder.mkdir(parents=True)
         about = {"seed": int(name[-1]), "size": "xs", "env_id": "FourRooms11-v0", "prefill": 2_000}
         (folder / "args.json").write_text(json.dumps(about))
-        lines = [f"{10 * (i + 1)},{0.9 if i >= jump else 0.1},10" for i in range(1_000)]
+        after = [0.9 if i >= jump else 0.1 for i in range(200, 1_000)]
+        returns = [1.0] * 200 + after  # random play's first
+        lines = [f"{10 * (i + 1)},{value},10" for i, value in enumerate(returns)]
         (folder / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + "\n".join(lines) + "\n")
         columns = "global_step,eval/real_return,eval/dreamed_return\n"
         (folder / "updates.csv").write_text(columns + "5000,0.2,0.5\n10000,nan,nan\n")
@@ -628,7 +631,8 @@ def test_steps_to_a_return_and_curves(tmp_path):
     assert (
         rows["dreamer", 1]["steps_to_0.85"] == 10 * (300 + 188) - 2_000
     )  # 0.1 + 0.8 · 188 / 200 is the first above 0.85
-    assert runs[0]["steps"].tolist() == list(range(10, 8_010, 10))
+    assert runs[0]["steps"].tolist() == list(range(500, 8_010, 10)) and np.allclose(runs[0]["means"][:51], 0.1)
+    assert np.allclose(runs[0]["means"][[52, 150]], [(0.1 * 100 + 0.9 * 2) / 102, 0.5])
     lines = dreamer_report.table([run["row"] for run in runs])
     assert (
         lines[2].startswith("| Dreamer | 2 | 3,000 ± 12,706 | ") and "| not reached | not reached | 0.100 |" in lines[3]
@@ -648,6 +652,10 @@ def test_steps_to_a_return_and_curves(tmp_path):
     )
     with pytest.raises(SystemExit, match="--known .*: cannot be read"):
         dreamer_report.read_known(tmp_path)
+    path = tmp_path / "runs" / "dreamer_seed1" / "episodes.csv"
+    path.write_text("".join(path.read_text().splitlines(True)[: 1 + 200 + 49]))
+    with pytest.raises(SystemExit, match="holds no run"):  # its first mean is yet to come
+        dreamer_report.read_runs(tmp_path / "runs")
 
 
 def test_goals_by_what_the_replay_paid(small_run, capsys):

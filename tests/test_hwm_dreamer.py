@@ -307,7 +307,10 @@ def test_a_fixed_interval_is_seen_in_play(tmp_path, capsys):
     run(*SMALL, "--fixed-interval", 4, "--stop-at", 1000, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
     capsys.readouterr()
     dreamer_reads.main(dreamer_reads.Args(tmp_path / "run", episodes=20))
-    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[3:]]
+    head, _, _, *lines = capsys.readouterr().out.splitlines()
+    rows = [line.strip("| ").split(" | ") for line in lines]
+    steps = sum(int(number.replace(",", "")) for name, number, _ in rows if name.startswith("age"))
+    assert f" {steps:,} steps after an episode's second, 0.2" in head
     reads = {name: float(rate) for name, _, rate in rows}
     assert [name for name in reads if name.startswith("age")] == [f"age {n}" for n in (1, 2, 3, 4)]
     assert [reads[f"age {n}"] for n in (1, 2, 3, 4)] == [0, 0, 0, 1]
