@@ -1100,7 +1100,8 @@ class ReplayBuffer:
         size = 4 * math.prod(shape)
         if added and not (path.exists() and path.stat().st_size == size):
             raise RunError(f"{path}: not the replay buffer of the last checkpoint; the run cannot be gone on with")
-        with open(path, "ab") as file:
+        path.touch()
+        with open(path, "r+b") as file:  # not "a": file systems without fallocate of their own refuse it then
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)  # a full disk is an error here, not a signal later
             file.truncate(size)

@@ -22,7 +22,8 @@ again after every crash: on the same machine the run ends with the same bytes.
 | T, network, batch, epochs | 0.01, 256-256 with ReLU, in Gopher behind DQN's convolutions, 64, 100; Gopher 20 | ours, not given; benchmark/apple_alpha.sh compares T |
 | split | by frame: neighbours of a test frame are trained on; `--split episode` keeps whole episodes apart | section 2.4.1; ours |
 
-Demonstrations of Atari hold seeds and actions; their frames, 28 kB each as stacks of four, are made again in memory (1.6 GB).
+Demonstrations of Atari hold seeds and actions; their frames, 28 kB each as stacks of four, are made again in memory (1.6 GB, for
+a moment twice that).
 People play frame by frame (`record_human.py`): each of their frames is one to learn from, seen as an agent would see it there.
 The number of rewards in each life, the unit in which Table 2.2 seems to count (see the README), is in `evaluation.json` beside
 the points.
@@ -740,7 +741,10 @@ def read_episode(path: Path, checksum: str, env: gym.Env, frame_skip: int = ATAR
     scored = np.issubdtype(rewards.dtype, np.number) and rewards.shape == actions.shape and np.isfinite(rewards).all()
     require(bool(scored), "--demos", path, "rewards must be finite numbers (T,)")
     if atari:
-        require(actions.ndim == 1 and episode["seed"].shape == (), "--demos", path, "needs actions (T,) and one seed")
+        seed = episode["seed"]
+        seeded = seed.shape == () and np.issubdtype(seed.dtype, np.integer) and seed >= 0
+        allowed = "needs actions (T,), and as seed a whole number from 0 on"
+        require(actions.ndim == 1 and bool(seeded), "--demos", path, allowed)
         episode["observations"] = watch(env, episode) if frame_skip == ATARI_SKIP else watch_frames(env, episode)
         allowed = "gives other rewards when it is played again: of another version of ale-py?"
         require(episode["observations"] is not None, "--demos", path, allowed)
@@ -804,7 +808,7 @@ def read_demonstrations(folder: Path, env_id: str, frames: int) -> list[dict[str
     require(same_game, "--demos", folder, f"was recorded in {recorded}, --env-id is {env_id}")
     env, frame_skip = make_env(env_id), ATARI_SKIP
     if is_atari(env_id):
-        options = dict(manifest.get("options") or {})
+        options = manifest["options"] if isinstance(manifest.get("options"), dict) else {}
         frame_skip = options.get("frame_skip")
         same = frame_skip in (1, ATARI_SKIP) and options.get("noop_max") == RECORDED["noop_max"]
         require(same, "--demos", folder, f"was recorded with {options}, needs {RECORDED} or a frame_skip of 1")
@@ -1267,6 +1271,11 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     return run_dir, checkpoint
 
 
+def has_begun(run_dir: Path | None) -> bool:
+    """Whether a folder holds more than what a crash left behind before the run began."""
+    return run_dir is not None and run_dir.is_dir() and any(path.suffix != ".tmp" for path in run_dir.iterdir())
+
+
 def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
     """Whether `result.json` says that the run has come to `last_step` and was evaluated as asked for."""
     if not (run_dir / "result.json").exists():
@@ -1449,15 +1458,12 @@ def numpy_policy(student: Student, mode: str, seed: int):
     return policy
 
 
-def record_video(student: Student, args: Args, run_dir: Path, seed: int) -> None:
-    """Play one episode and write it into `videos/`."""
+def record_video(episode: dict[str, np.ndarray], args: Args, run_dir: Path) -> None:
+    """Play an episode again by its seed and actions and write it into `videos/`."""
     env = gym.wrappers.RecordVideo(make_env(args.env_id, "rgb_array"), str(run_dir / "videos"), lambda episode: True)
-    policy = numpy_policy(student, args.eval_mode, seed)
-    obs, _ = env.reset(seed=seed)
-    for _ in range(MAX_EVALUATION_STEPS):
-        obs, _, terminated, truncated, _ = env.step(int(policy(obs[None])[0]))
-        if terminated or truncated:
-            break
+    env.reset(seed=int(episode["seed"]))
+    for action in episode["actions"].tolist():
+        env.step(action)
     env.close()
 
 
@@ -1481,14 +1487,14 @@ def evaluate(student: Student, update: Update, networks: dict[str, torch.Tensor]
     for name, vector in networks.items():
         update.vector.copy_(vector)
         for mode in ("sampled", "greedy"):
-            episodes = play_student(student, mode, args, seeds)
+            episodes = play_student(student, mode, args, seeds, keep=args.capture_video)
             returns = [float(episode["rewards"].sum()) for episode in episodes]
             evaluation[name + mode] = {"mode": mode, **summary(returns), "returns": returns}
             if is_atari(args.env_id):
                 lives = [score for episode in episodes for score in rewards_per_life(episode)]
                 evaluation[name + mode] |= {"rewards_per_life": summary(lives), "lives": lives}
-    if args.capture_video:
-        record_video(student, args, run_dir, seeds[0])
+            if args.capture_video and name + mode == args.eval_mode:
+                record_video(episodes[0], args, run_dir)
     write_json(run_dir / "evaluation.json", evaluation)
     return evaluation
 
@@ -1635,20 +1641,21 @@ def play_teacher(teacher: QNetwork | AtariQNetwork, frames: int, args: Args) -> 
 
 def fingerprint(human: Frames, teacher: QNetwork | None) -> str:
     """SHA-256 of all that is learned from."""
-    digest = hashlib.sha256(human.obs.tobytes() + human.actions.tobytes())
+    digest = hashlib.sha256(human.obs)
+    digest.update(human.actions)
     for tensor in () if teacher is None else teacher.state_dict().values():
         digest.update(tensor.numpy().tobytes())
     return digest.hexdigest()
 
 
-def train_epoch(update: Update, training: Data, args: Args) -> dict[str, float]:
-    """One pass over the training frames in a random order; the last minibatch of fewer frames is left out."""
-    sums, count = torch.zeros(2, device=training.rl_obs.device), 0
-    for frames in torch.randperm(len(training.he_obs)).split(args.batch_size):
+def train_epoch(update: Update, data: Data, training: torch.Tensor, args: Args) -> dict[str, float]:
+    """One pass over the frames of the indices `training` in a random order; a last minibatch of fewer is left out."""
+    sums, count = torch.zeros(2, device=data.rl_obs.device), 0
+    for frames in training[torch.randperm(len(training))].split(args.batch_size):
         if len(frames) < args.batch_size and count:
             break
         masks = draw_masks((2, len(frames), args.hidden_size), args.dropout).to(sums.device)
-        sums += torch.stack(update(training.at(frames.to(sums.device)), masks))
+        sums += torch.stack(update(data.at(frames.to(sums.device)), masks))
         count += 1
     rl_loss, he_loss = (sums / count).tolist()
     return {"losses/rl": rl_loss, "losses/human": he_loss}
@@ -1660,23 +1667,28 @@ def main(args: Args) -> int:
     make_env(args.env_id).close()
     if args.capture_video:
         check_video(args.env_id)
+    last_epoch = min(args.epochs, args.stop_at)
+    begun = open_run_dir(args) if has_begun(args.run_dir) else None  # before the minutes that demonstrations take
+    if begun and is_done(args.run_dir, args, last_epoch):
+        print(f"{args.run_dir} is done")
+        return 0
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     bf16 = args.bf16 and has_bf16(device)
     teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id, bf16)
     human_episodes = read_human(args)
     torch.set_num_threads(args.num_threads)
     human = join_frames(human_episodes, args.demo_frames)
+    if is_atari(args.env_id):  # gigabytes, which are in `human` now
+        for episode in human_episodes:
+            del episode["observations"]
     data = label_frames(human, teacher, args)
     split_rng = np.random.default_rng(np.random.SeedSequence([args.seed, 0]))
     is_test = torch.from_numpy(split_frames(human.episodes, args.test_frames, args.split, split_rng))
     require(not is_test.all(), "--split", args.split, f"leaves no episode to train on, with {args.test_frames} to test")
-    run_dir, checkpoint = open_run_dir(args)
-    last_epoch, learned_from = min(args.epochs, args.stop_at), fingerprint(human, teacher)
+    run_dir, checkpoint = begun or open_run_dir(args)
+    learned_from = fingerprint(human, teacher)
     same_data = checkpoint is None or checkpoint["data"] == learned_from
     require(same_data, "--resume", run_dir, "demonstrations or teacher are no longer those that the run began with")
-    if is_done(run_dir, args, last_epoch):
-        print(f"{run_dir} is done")
-        return 0
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
     write_json(run_dir / "args.json", arguments(args))
@@ -1695,10 +1707,10 @@ def main(args: Args) -> int:
         print("--bf16: no bfloat16 instructions here, goes on in float32", file=sys.stderr)
     stop = StopSignal()
 
-    training, test = (data.at(rows).to(device) for rows in (~is_test, is_test))
+    data, test, training = data.to(device), data.at(is_test).to(device), torch.nonzero(~is_test).squeeze(1)
     shapes = tuple(data.he_obs.shape[1:]), data.rl_labels.shape[1], args.hidden_size
     student = Student(*shapes, bf16).to(device)
-    update = Update(student, args, training.at(torch.arange(min(args.batch_size, len(training.he_obs)))))
+    update = Update(student, args, data.at(training[: args.batch_size].to(device)))
     arithmetic = f"{'compiled' if update.is_compiled else 'plain'} on {device.type}"
     best = {"vector": update.vector.clone(), "accuracy": -1.0, "epoch": 0, **dict.fromkeys(("rl", "human"), 0.0)}
     epoch, training_seconds, offset = 0, 0.0, 0
@@ -1720,7 +1732,7 @@ def main(args: Args) -> int:
 
     while epoch < last_epoch:
         epoch += 1
-        metrics = {**train_epoch(update, training, args), **measure(student, test, args)}
+        metrics = {**train_epoch(update, data, training, args), **measure(student, test, args)}
         if metrics["test/accuracy"] > best["accuracy"]:
             agreement = {"rl": metrics["test/accuracy_rl"], "human": metrics["test/accuracy_human"]}
             best = {"vector": update.vector.clone(), "accuracy": metrics["test/accuracy"], "epoch": epoch, **agreement}

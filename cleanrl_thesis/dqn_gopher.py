@@ -20,7 +20,7 @@ machine the run ends with the same bytes.
 | games side by side | 8 | ours |
 
 Frames are game frames everywhere in chapter 2. The replay buffer holds every frame that the agent saw once: 7,063 bytes
-for each, 7.1 GB in all, in a file that the operating system keeps in memory as far as there is room.
+for each, 7.8 GB with the room between two checkpoints, in a file that the operating system keeps in memory as far as it can.
 """
 
 # /// script
@@ -473,7 +473,8 @@ class ReplayBuffer:
         size = self.slots * num_envs * self.dtype.itemsize
         if added and not (path.exists() and path.stat().st_size == size):
             raise RunError(f"{path}: not the replay buffer of the last checkpoint; the run cannot be gone on with")
-        with open(path, "ab") as file:
+        path.touch()
+        with open(path, "r+b") as file:  # not "a": file systems without fallocate of their own refuse it then
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)  # a full disk is an error here, not a signal later
             file.truncate(size)
@@ -861,15 +862,13 @@ def check_video(args: Args) -> None:
         raise UsageError(f"--capture-video: cannot draw {args.env_id} here: {first_line(error)}") from None
 
 
-def record_video(policy, args: Args, run_dir: Path) -> None:
-    """Play the first evaluation episode once more and write it into `videos/`."""
+def record_video(episode: dict[str, np.ndarray], args: Args, run_dir: Path) -> None:
+    """Play an episode of `play_atari` again and write it into `videos/`."""
     env = make_atari(args.env_id, "rgb_array", **game_options(args))
     env = gym.wrappers.RecordVideo(env, str(run_dir / "videos"), lambda episode: True)
-    obs, _ = env.reset(seed=episode_seed(args.seed, EVALUATION_STREAM, 0))
-    ended = False
-    while not ended:
-        obs, _, terminated, truncated, _ = env.step(int(policy(obs[None])[0]))
-        ended = terminated or truncated
+    env.reset(seed=int(episode["seed"]))
+    for action in episode["actions"].tolist():
+        env.step(action)
     env.close()
 
 
@@ -886,7 +885,7 @@ def evaluate(agent: AtariQNetwork, args: Args, run_dir: Path, device: torch.devi
     episodes = play_atari(policy, lambda: make_atari(args.env_id, **game_options(args)), seeds)
     returns = [float(episode["rewards"].sum()) for episode in episodes]
     if args.capture_video:
-        record_video(evaluation_policy(agent, args, device), args, run_dir)
+        record_video(episodes[0], args, run_dir)
     lives = [score for episode in episodes for score in rewards_per_life(episode)]
     evaluation = {
         "env_id": args.env_id,

@@ -1,9 +1,11 @@
 """Gopher: the game beside Gymnasium's wrappers, the replay buffer beside a list, runs of the DQN and of its students."""
 
 import csv
+import fcntl
 import functools
 import importlib
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -12,6 +14,7 @@ import time
 from pathlib import Path
 
 import ale_py
+import cv2
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -27,7 +30,7 @@ from cleanrl_thesis import dqn_gopher as dqn
 SCRIPT = ROOT / "cleanrl_thesis" / "dqn_gopher.py"
 RAM = ["--obs-type", "ram", "--hidden-size", 32, "--eval-episodes", 2, "--eval-epsilon", 0.5]
 SMALL = [
-    *(*RAM, "--total-timesteps", 20_000, "--num-envs", 4, "--buffer-size", 3_000, "--learning-starts", 4_000),
+    *(*RAM, "--total-timesteps", 20_000, "--num-envs", 4, "--buffer-size", 1_000, "--learning-starts", 4_000),
     *("--checkpoint-interval", 4_000),
 ]
 RECORDS = ("episodes.csv", "updates.csv", "evaluation.json")
@@ -120,15 +123,71 @@ def test_what_is_drawn_is_what_was_seen(rows, spare, tmp_path):
     assert seen == {(row, game) for row, game in played if first <= row < FRAMES - 1}
 
 
-def test_a_million_frames_take_seven_gigabytes():
-    """Each frame is there once, with seven bytes beside it: the bound that the docstring states."""
-    fields = dqn.row_type((84, 84))
+def test_a_million_frames_take_eight_gigabytes():
+    """Each frame is there once, with seven bytes beside it, and room for two checkpoints: what the docstring states."""
+    fields, args = dqn.row_type((84, 84)), dqn.complete_args(dqn.Args())
     assert fields.itemsize == 84 * 84 + 7 == 7_063
+    between = args.checkpoint_interval // args.frame_skip + args.num_envs
+    assert round((args.buffer_size + 2 * between) * fields.itemsize / 1e9, 1) == 7.8
 
 
 def test_the_file_of_a_run_is_as_large_as_stated(small):
-    rows, spare = 3_000 // 4, 2 * (4_000 // 16 + 1)
+    rows, spare = 1_000 // 4, 2 * (4_000 // 16 + 1)
     assert (small / "replay.dat").stat().st_size == (rows + spare) * 4 * (128 + 7)
+
+
+def test_the_file_is_made_where_the_system_cannot_reserve_it(tmp_path, monkeypatch):
+    """The C library's way to do without takes no file that is open for appending."""
+    opened = []
+    monkeypatch.setattr(
+        os, "posix_fallocate", lambda file, begin, size: opened.append(fcntl.fcntl(file, fcntl.F_GETFL))
+    )
+    dqn.ReplayBuffer(tmp_path / "replay.dat", 10, 2, 3, (4, 5))
+    assert opened and not opened[0] & os.O_APPEND
+
+
+# Playing
+class ScriptedGame:
+    """Has a reward, lives, and whether it has ended or run out of time, for each step of an episode; shows its number."""
+
+    def __init__(self, episodes: list[list[tuple[float, int, bool, bool]]]):
+        self.episodes, self.stack = iter(episodes), np.zeros((2, 1), np.uint8)
+        self.shown = 0
+
+    def look(self) -> np.ndarray:
+        self.stack[:-1] = self.stack[1:]
+        self.stack[-1] = self.shown
+        self.shown += 1
+        return self.stack.copy()
+
+    def reset(self, seed: int) -> tuple[np.ndarray, dict]:
+        self.steps, self.lives = iter(next(self.episodes)), 3
+        return self.look(), {}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        reward, self.lives, terminated, truncated = next(self.steps)
+        return self.look(), reward, terminated, truncated, {}
+
+
+@pytest.mark.parametrize("signs, life_ends", [(True, False), (False, True)])
+def test_what_players_put_into_the_buffer(signs, life_ends, tmp_path):
+    """Signs or points; an end, a lost life where asked for, and a time-out, behind which a value is left."""
+    script = [[(20.0, 3, False, False), (100.0, 2, False, False), (-5.0, 2, True, False)], [(0.0, 3, False, True)], []]
+    args = dqn.Args(clip_rewards=signs, life_loss_ends=life_ends)
+    players = dqn.Players([ScriptedGame(script)], args)
+    players.start(0, 0)
+    buffer = dqn.ReplayBuffer(tmp_path / "replay.dat", 10, 2, 1, (2, 1))
+    ended = [players.step(np.array([action]), buffer) for action in (4, 5, 6, 7, 1, 2)]
+    assert ended == [[], [], [(115.0, 12)], [], [(0.0, 4)], []]
+    rows = buffer.map[: buffer.added]
+    assert rows["frame"].ravel().tolist() == [0, 1, 2, 3, 4, 5]  # the last ones of episodes too
+    assert rows["reward"].tolist() == ([1, 1, -1, 0, 0, 0] if signs else [20, 100, -5, 0, 0, 0])
+    goes_on, ends, not_played = dqn.GOES_ON, dqn.ENDS, dqn.NOT_PLAYED
+    lost = ends if life_ends else goes_on
+    assert rows["follows"].tolist() == [goes_on, lost, ends, not_played, goes_on, not_played]
+    assert rows["age"].tolist() == [0, 1, 2, 3, 0, 1]
+    played = [0, 1, 2, 4]
+    assert rows["action"][played].tolist() == [4, 5, 6, 1]
 
 
 # The network
@@ -201,29 +260,50 @@ def assert_same_run(left: Path, right: Path) -> None:
         assert all(torch.equal(value, other[name]) for name, value in mine.items())
 
 
-def rows(path: Path) -> int:
-    return path.read_bytes().count(b"\n") if path.exists() else 0
+def modified(path: Path) -> int:
+    return path.stat().st_mtime_ns if path.exists() else 0
 
 
-def kill(flags: list, folder: Path, number: int, at_row: int) -> None:
-    """Start or resume a run and send it a signal once `episodes.csv` has `at_row` rows."""
-    line = command(*flags, "--run-dir", folder, "--resume", script=SCRIPT)
+def kill(flags: list, folder: Path, number: int) -> None:
+    """Start or resume a run and send it a signal soon after its next checkpoint."""
+    path, line = folder / "checkpoint.pt", command(*flags, "--run-dir", folder, "--resume", script=SCRIPT)
+    before = modified(path)
     process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    while process.poll() is None and rows(folder / "episodes.csv") < at_row:
+    while process.poll() is None and modified(path) in (0, before):
         time.sleep(0.002)
+    time.sleep(0.1)  # rows and frames that the checkpoint does not count
     process.send_signal(number)
     out, _ = process.communicate(timeout=120)
     assert process.returncode == (-number if number == signal.SIGKILL else 128 + number), out
 
 
 def test_a_killed_run_ends_with_the_same_bytes(small, tmp_path):
-    """Killed within the episodes of four games: they are played again from their seeds."""
-    for at_row in (1, 2):
-        kill(SMALL, tmp_path / "run", signal.SIGKILL, at_row)
-    kill(SMALL, tmp_path / "run", signal.SIGTERM, 4)
+    """Killed within the episodes of four games, each time it has gone on: they are played again from their seeds."""
+    for number in (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM):
+        kill(SMALL, tmp_path / "run", number)
     done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert "differs" not in done.stderr
     assert_same_run(small, tmp_path / "run")
+
+
+def test_a_torn_checkpoint_goes_on_from_the_one_before(small, tmp_path):
+    """By then the ring has gone round: what that checkpoint counts has to be there still."""
+    flags = [*SMALL, "--run-dir", "run", "--resume"]
+    run(*flags, "--stop-at", 16_000, cwd=tmp_path, script=SCRIPT)
+    path = tmp_path / "run" / "checkpoint.pt"
+    path.write_bytes(path.read_bytes()[:1000])
+    assert "torn" in run(*flags, cwd=tmp_path, script=SCRIPT).stderr
+    assert_same_run(small, tmp_path / "run")
+
+
+def test_schedules_of_a_run(tmp_path):
+    """ε falls to --end-e over its share of the frames, the learning rate to 0 over all."""
+    flags = [*RAM, "--total-timesteps", 40_000, "--anneal-lr", "--exploration-fraction", 0.5, "--no-double"]
+    run(*flags, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    updates = np.genfromtxt(tmp_path / "run" / "updates.csv", delimiter=",", names=True, deletechars="")
+    frames = updates["global_step"] - 32  # of the step before, which was taken with them
+    assert np.allclose(updates["charts/epsilon"], np.maximum(1 - 0.99 * frames / 20_000, 0.01))
+    assert np.allclose(updates["charts/learning_rate"], 1e-4 * (1 - frames / 40_000))
 
 
 def test_a_run_on_pixels_stops_and_goes_on(tmp_path):
@@ -303,10 +383,22 @@ def test_copied_alone_into_an_empty_folder(small, tmp_path):
     assert (tmp_path / "run" / "updates.csv").read_bytes() == (small / "updates.csv").read_bytes()
 
 
-def test_a_video_is_recorded(tmp_path):
+def test_a_video_is_the_first_evaluation_episode(tmp_path):
+    """As long as that episode, a picture of each of its steps and of its beginning."""
     flags = [*RAM, "--total-timesteps", 3_200, "--noop-max", 0, "--capture-video", "--run-dir", "run"]
     run(*flags, cwd=tmp_path, script=SCRIPT)
-    assert len(list((tmp_path / "run" / "videos").glob("*.mp4"))) == 1
+    (path,) = (tmp_path / "run" / "videos").glob("*.mp4")
+    evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    video, pictures = cv2.VideoCapture(str(path)), 0
+    while video.read()[0]:
+        pictures += 1
+    network, args = dqn.AtariQNetwork((4, 128), 8, 32, True), dqn.Args(obs_type="ram", noop_max=0, eval_epsilon=0.5)
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    network.load_state_dict(state["learner"]["agent"])
+    make_game = functools.partial(dqn.make_atari, "ALE/Gopher-v5", **dqn.game_options(args))
+    policy = dqn.evaluation_policy(network, args, torch.device("cpu"))
+    first = dqn.play_atari(policy, make_game, evaluation["seeds"])[0]
+    assert pictures - len(first["actions"]) in (0, 1)  # the writer may leave out the last
 
 
 def test_a_lost_replay_buffer_is_not_taken_for_an_empty_one(tmp_path):
@@ -387,6 +479,13 @@ def test_the_report_takes_whatever_is_done(pixel_teacher, student, tmp_path):
     assert f"| {mean:.2f} |" in text and f"| {hybrid['mean']:.0f} |" in text
     assert f"| hybrid, α = 0.8, less BC, α = 0 | +2.1 | {mean - clone['rewards_per_life']['mean']:+.1f} |" in text
     assert "| α = 1, less α = 0.7 |  |  |  |  |  |" in text and "nan" not in text
+    shutil.copytree(tmp_path / "runs" / "alpha0.0_seed1", tmp_path / "more" / "alpha0_seed1")
+    for name in ("teacher_seed1", "teacher_ram_seed1"):  # no student yet, and a run that is none of the sweep
+        shutil.copytree(pixel_teacher, tmp_path / "teachers" / name)
+    shutil.copytree(pixel_teacher, tmp_path / "more" / "teacher_seed1")
+    for runs, has in (("teachers", False), ("more", True)):
+        run("--runs", runs, "--out", runs, "--human-episodes", 1, cwd=tmp_path, script=script)
+        assert ("| BC, α = 0 | sampled | 1 |" in (tmp_path / runs / "table.md").read_text()) == has
     for name in ("fig_2_6.png", "teacher.png", "runs.csv"):
         assert (tmp_path / "out" / name).stat().st_size > 100
 
@@ -436,14 +535,31 @@ def test_the_synthetic_human_presses_and_lets_go():
     assert first["rewards"].sum() > 0
 
 
-def test_a_killed_student_of_gopher_ends_with_the_same_bytes(student, pixel_teacher, tmp_path):
+def test_a_stopped_student_of_gopher_ends_with_the_same_bytes(student, pixel_teacher, tmp_path):
     flags = [*SMALL_DISTILL, "--teacher", pixel_teacher, "--bf16", "--run-dir", "run"]
     run(*flags, "--stop-at", 2, cwd=tmp_path, script=DISTILL)
     run(*flags, "--resume", cwd=tmp_path, script=DISTILL)
     for name in ("updates.csv", "evaluation.json"):
         assert (tmp_path / "run" / name).read_bytes() == (student / name).read_bytes()
+    states = [
+        torch.load(folder / "checkpoint.pt", weights_only=True)["update"] for folder in (student, tmp_path / "run")
+    ]
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
     evaluation = json.loads((student / "evaluation.json").read_text())
     assert evaluation["sampled"]["rewards_per_life"]["episodes"] >= 3
+
+
+def test_a_finished_student_is_not_prepared_again(student, tmp_path, capsys):
+    """It is told before the teacher is read and anything is played; and so is that a folder is taken."""
+    args = json.loads((student / "args.json").read_text())
+    flags = [*SMALL_DISTILL, "--teacher", args["teacher"], "--bf16", "--save-model", "--save-demos", 1]
+    for name in ("run", "taken"):  # a process keeps its lock
+        shutil.copytree(student, tmp_path / name)
+    begin = time.perf_counter()
+    assert distill.cli([*map(str, flags), "--run-dir", str(tmp_path / "run"), "--resume"]) == 0
+    assert f"{tmp_path / 'run'} is done" in capsys.readouterr().out
+    assert_refused(distill, capsys, [*flags, "--run-dir", tmp_path / "taken"], ["--run-dir", "exists"])
+    assert time.perf_counter() - begin < 3
 
 
 def test_recordings_of_gopher_are_played_again_and_learned_from(student, pixel_teacher, tmp_path):
@@ -480,12 +596,15 @@ def test_frames_of_a_person_are_what_an_agent_would_see(student):
     [
         (lambda f: rewrite(f, lambda a: {**a, "actions": 7 - a["actions"]}), ["other rewards", "ale-py"]),
         (lambda f: rewrite(f, lambda a: {**a, "emulator_state": a["emulator_state"][::-1]}), ["other rewards"]),
-        (lambda f: rewrite(f, lambda a: {**a, "seed": np.array([1, 2])}), ["one seed"]),
+        (lambda f: rewrite(f, lambda a: {**a, "seed": np.array([1, 2])}), ["seed a whole number"]),
+        (lambda f: rewrite(f, lambda a: {**a, "seed": np.array(-1)}), ["seed a whole number"]),
+        (lambda f: rewrite(f, lambda a: {**a, "seed": np.array("x")}), ["seed a whole number"]),
+        (lambda f: edit_manifest(f, lambda m: m.update(options=["frame_skip"])), ["recorded with {}"]),
         (lambda f: rewrite(f, lambda a: {k: v for k, v in a.items() if k != "seed"}), ["no demonstration"]),
         (lambda f: edit_manifest(f, lambda m: m["options"].update(frame_skip=3)), ["frame_skip", "3"]),
         (lambda f: edit_manifest(f, lambda m: m["options"].update(frame_skip=1)), ["other rewards"]),
     ],
-    ids=["actions", "state", "seeds", "none", "skip", "frames"],
+    ids=["actions", "state", "seeds", "negative", "word", "list", "none", "skip", "frames"],
 )
 def test_a_wrong_recording_is_named(damage, words, student, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
