@@ -114,7 +114,7 @@ class Args:
     resume: bool = False
     """go on from the checkpoint in `--run-dir`; start where there is none"""
     checkpoint_interval: int = 100_000
-    """steps between checkpoints; the replay file has room for two intervals beyond `--buffer-size`"""
+    """steps between checkpoints; the replay file has room for as many transitions twice beyond `--buffer-size`"""
     stop_at: int | None = None
     """end at this step of the full schedule; `--resume` can finish the run later"""
 

@@ -119,7 +119,7 @@ class Args:
     eval_episodes: int | None = None
     """episodes of the evaluation at the end, sampled and greedy; default: 400 (Table 2.1), Atari 100"""
     eval_mode: Literal["sampled", "greedy"] = "sampled"
-    """whether video and demonstrations sample from the policy or take its most probable action"""
+    """whether video and demonstrations sample from the policy or take its most probable action, in Atari but for 1% random ones"""
     run_dir: Path | None = None
     """the run's folder; default: runs/{env_id}__{exp_name}__{seed}__{unix time}"""
     resume: bool = False

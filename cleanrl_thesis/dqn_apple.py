@@ -148,7 +148,7 @@ class Args:
     train_frequency: int = 4
     """frames per update"""
     max_grad_norm: float = 10.0
-    """bound on the norm of the gradient; inf for none (Baselines)"""
+    """bound on the norm of the gradient, of all parameters together; inf for none (Baselines: the same, of each variable)"""
     double: bool = True
     """double DQN: the online network chooses the next action, the target network values it (Baselines)"""
     dueling: bool = True

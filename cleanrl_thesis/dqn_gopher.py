@@ -139,6 +139,8 @@ class Args:
     """frames in the replay buffer, of those that the agent saw (section 2.4.2)"""
     gamma: float = 0.99
     """discount factor γ per action (Baselines)"""
+    n_step: int = 1
+    """actions whose rewards a target sums up before it asks the target network (Baselines: 1)"""
     target_network_frequency: int = 4_000
     """frames between updates of the target network (Baselines)"""
     batch_size: int = 32
@@ -154,7 +156,7 @@ class Args:
     train_frequency: int = 16
     """frames per update (Baselines)"""
     max_grad_norm: float = 10.0
-    """bound on the norm of the gradient; inf for none (Baselines)"""
+    """bound on the norm of the gradient, of all parameters together; inf for none (Baselines: the same, of each variable)"""
     double: bool = True
     """double DQN: the online network chooses the next action, the target network values it (Baselines)"""
     dueling: bool = True
@@ -209,7 +211,7 @@ def complete_args(args: Args) -> Args:
     )
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
-        ("train_frequency target_network_frequency", lambda x: x >= 1, "must be at least 1"),
+        ("train_frequency target_network_frequency n_step", lambda x: x >= 1, "must be at least 1"),
         ("learning_rate", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("max_grad_norm", lambda x: x > 0, "must be greater than 0"),
         ("gamma start_e end_e exploration_fraction eval_epsilon", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
@@ -225,8 +227,10 @@ def complete_args(args: Args) -> Args:
     args.num_iterations = args.total_timesteps // frames
     allowed = f"must be at least one step of every game, {frames} frames"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
-    least = (args.frame_stack + 2) * args.num_envs  # of two rows to draw from, one may begin no transition
-    allowed = f"must be at least --frame-stack and two more frames of every game, {least}"
+    least = (
+        args.frame_stack + args.n_step + 1
+    ) * args.num_envs  # of two rows to draw from, one may begin no transition
+    allowed = f"must be at least --frame-stack, --n-step and one more frames of every game, {least}"
     require(args.buffer_size >= least, "--buffer-size", args.buffer_size, allowed)
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")
@@ -439,13 +443,13 @@ GOES_ON, ENDS, NOT_PLAYED = 0, 1, 2  # what follows a frame: another one with a 
 
 
 class Minibatch(NamedTuple):
-    """M transitions."""
+    """M transitions of n steps."""
 
     obs: torch.Tensor  # (M, S, ...) uint8
     actions: torch.Tensor  # (M,) int64
-    returns: torch.Tensor  # (M,), rewards
-    discounts: torch.Tensor  # (M,), γ, or 0 where the episode ended
-    next_obs: torch.Tensor  # (M, S, ...) uint8
+    returns: torch.Tensor  # (M,), discounted sum of the n rewards
+    discounts: torch.Tensor  # (M,), γⁿ, or 0 where the episode ended
+    next_obs: torch.Tensor  # (M, S, ...) uint8, n steps later
 
     def to(self, device: torch.device) -> "Minibatch":
         return Minibatch(*(tensor.to(device) for tensor in self))
@@ -491,19 +495,30 @@ class ReplayBuffer:
     def next_row(self) -> None:
         self.added += 1
 
-    def sample(self, batch_size: int, gamma: float, rng: np.random.Generator) -> Minibatch:
-        """Transitions that are drawn uniformly; the newest row has no next one yet."""
+    def sample(self, batch_size: int, gamma: float, n_step: int, rng: np.random.Generator) -> Minibatch:
+        """Transitions that are drawn uniformly; the newest rows have no n next ones yet."""
         oldest = self.added - self.rows
         first = oldest + self.frame_stack - 1 if oldest > 0 else 0
-        low, high = first * self.num_envs, (self.added - 1) * self.num_envs
+        low, high = first * self.num_envs, (self.added - n_step) * self.num_envs
         picks, total = rng.integers(low, high, batch_size), self.slots * self.num_envs
         while (unplayed := self.fields["follows"][picks % total] == NOT_PLAYED).any():
             picks[unplayed] = rng.integers(low, high, unplayed.sum())
-        slots = picks % total
-        discounts = np.where(self.fields["follows"][slots] == GOES_ON, np.float32(gamma), np.float32(0))
-        columns = self.fields["action"][slots].astype(np.int64), self.fields["reward"][slots], discounts
-        obs, next_obs = self.stacked(picks), self.stacked(picks + self.num_envs)
-        return Minibatch(*map(torch.from_numpy, (obs, *columns, next_obs)))
+        actions = self.fields["action"][picks % total].astype(np.int64)
+        returns, discounts, ends = self.followed(picks, gamma, n_step)
+        return Minibatch(*map(torch.from_numpy, (self.stacked(picks), actions, returns, discounts, self.stacked(ends))))
+
+    def followed(self, picks: np.ndarray, gamma: float, n_step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns and discounts (M,) float32 of n steps from the rows `picks`, and the rows where these end, at a time-out earlier."""
+        total, ends, goes_on = self.slots * self.num_envs, picks.copy(), np.ones(len(picks), bool)
+        returns, discounts = np.zeros(len(picks), np.float32), np.ones(len(picks), np.float32)
+        for _ in range(n_step):
+            follows = self.fields["follows"][ends % total]
+            goes_on &= follows != NOT_PLAYED
+            returns += np.where(goes_on, discounts * self.fields["reward"][ends % total], np.float32(0))
+            discounts[goes_on] *= np.where(follows == GOES_ON, np.float32(gamma), np.float32(0))[goes_on]
+            ends[goes_on] += self.num_envs
+            goes_on &= follows == GOES_ON
+        return returns, discounts, ends
 
     def stacked(self, picks: np.ndarray) -> np.ndarray:
         """The observations (M, S, ...) whose newest frames are `picks`; an episode's first frame stands in for those before."""
@@ -1110,9 +1125,9 @@ def main(args: Args) -> int:
             add_scalars(writer, charts, global_step)
             progress.set_postfix_str(f"return {episodic_return:.1f}", refresh=False)
 
-        if global_step >= args.learning_starts and buffer.added > args.frame_stack:
+        if global_step >= args.learning_starts and buffer.added > max(args.frame_stack, args.n_step):
             for _ in range(global_step // args.train_frequency - before // args.train_frequency):
-                minibatch = buffer.sample(args.batch_size, args.gamma, rng).to(device)
+                minibatch = buffer.sample(args.batch_size, args.gamma, args.n_step, rng).to(device)
                 means.add(learner.update(minibatch, remaining * args.learning_rate))
         if global_step // args.target_network_frequency > before // args.target_network_frequency:
             learner.copy_to_target()

@@ -7,7 +7,10 @@ A recurrent state-space model learns from the whole history of play to reconstru
 learn in what it imagines (Hafner et al. 2021). The replay keeps each state as three numbers and draws its frame when it is
 sampled. `--run-dir DIR --resume` can be sent again after every crash: on the same machine the run ends with the same bytes.
 
-| | thesis, `--size thesis` | `--size xs` |
+The thesis gives the size of the state, 1,624 numbers, and 400,000 updates in 2,000,000 steps; the other sizes and rates of
+`--size thesis` are those of DreamerV2 and of the public code of the thesis' author.
+
+| | `--size thesis` | `--size xs` |
 |---|---|---|
 | frames | 64 × 64, CNN of depth 48 | 22 × 22, a linear map of each 2 × 2 pixels (a cell of the 11 × 11 maze has four) |
 | state | deter 600, 32 × 32 classes | deter 128, 16 × 32 classes |
@@ -17,10 +20,10 @@ sampled. `--run-dir DIR --resume` can be sent again after every crash: on the sa
 | batches | 16 × 50, all states start a dream | 24 × 10, 64 states start one |
 | γ | 0.999 | 0.95: the frame does not show the time that a reward depends on, so only γ makes the agent hurry; at 0.99 a wrong value lives long, for states that see no reward learn it from each other |
 | Adam's ε | 1e-5 | 1e-8 for actor and critic: their gradients are so small that 1e-5 stalls them |
-| random play at first | not said | 1,000,000 steps, with a reward or more at each of 64 goal cells; after 200,000 there are 16 without one, which are never sought |
+| random play at first | 50,000 steps | 1,000,000 steps, with a reward or more at each of 64 goal cells; after 200,000 there are 10 to 17 without one, which are never sought |
 | rates | 2e-4, 4e-5, 1e-4 | 3e-3 for the model (at 1e-3 it needs five times the updates), 1e-3 for actor and critic |
 | rewards | tanh, weight 1 | as they are, weight 10 |
-| layers | SiLU, where the thesis has ELU: twice as fast on large batches | the same, normalised in the heads |
+| layers | SiLU, where DreamerV2 has ELU: twice as fast on large batches | the same, normalised in the heads |
 """
 
 # /// script
@@ -125,7 +128,7 @@ class Args:
     """environment steps"""
     num_envs: int = 10
     """games side by side"""
-    prefill: int = 1_000_000
+    prefill: int | None = None
     """first environment steps, of random play, without updates"""
     train_frequency: int = 5
     """environment steps per update"""
@@ -173,7 +176,7 @@ class Args:
     """weight of the entropy of the codes at first, to none over `--kl-warmup`; without it the goal, which is learned first, takes
     all codes, sharp ones that learn nothing more, and the agent is never drawn"""
     kl_warmup: int | None = None
-    """updates over which that weight grows from a tenth"""
+    """updates over which the weight of the KL divergence grows from a tenth"""
     kl_balance: float = 0.8
     """share of its gradient that trains the prior, the rest trains the posterior"""
     reward_scale: float | None = None
@@ -208,14 +211,14 @@ SIZES = {
     | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 64, "gamma": 0.95}
     | {"image_scale": 0.25, "kl_scale": 1.0}
     | {"kl_warmup": 1_000, "entropy_scale": 0.3, "reward_scale": 10.0, "tanh_reward": False}
-    | {"model_learning_rate": 3e-3, "adam_eps": 1e-8}
+    | {"prefill": 1_000_000, "model_learning_rate": 3e-3, "adam_eps": 1e-8}
     | {"actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3, "ent_coef": 3e-3},
     "thesis": {"encoder": "cnn", "frame_side": 64, "depth": 48, "deter": 600, "stoch": 32, "classes": 32}
     | {"hidden_size": 600, "head_size": 400, "head_layers": 4, "head_norm": False}
     | {"batch_size": 16, "chunk_length": 50, "rewarded_share": 0.0, "starts": 800, "gamma": 0.999}
     | {"image_scale": 1.0, "kl_scale": 0.1}
     | {"kl_warmup": 0, "entropy_scale": 0.0, "reward_scale": 1.0, "tanh_reward": True}
-    | {"model_learning_rate": 2e-4, "adam_eps": 1e-5}
+    | {"prefill": 50_000, "model_learning_rate": 2e-4, "adam_eps": 1e-5}
     | {"actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4, "ent_coef": 1e-3},
 }
 SIZES["s"] = SIZES["xs"] | {"deter": 256, "stoch": 32, "hidden_size": 256, "head_size": 256, "depth": 24}

@@ -9,7 +9,7 @@ The student π and the discriminator D play L_mix(π) = E_π[log D] + α E_RL[lo
 (Eq. 2.3.1): D makes it large, so D → 1 means *student*; π makes it small, by TRPO with the reward −log D. The reward of
 the environment never reaches the student.
 
-The expert's demonstrations are those of `ddpg_torcs_like.py --save-demos`, or of any script here. The human is by default
+The expert's demonstrations are those of `ddpg_torcs_like.py --save-demos`, or `ppo_continuous_kle.py`'s. The human is by default
 a **synthetic** one: a script that looks at the road now and then, reacts late and steers inexactly; it is made from no
 agent, and its score stands to the DDPG experts' as in Table 2.3. `--demos-human` takes recordings.
 `--run-dir DIR --resume` can be sent again after every crash: on the same machine the run ends with the same bytes.
@@ -256,9 +256,10 @@ def complete_args(args: Args) -> Args:
     require(not args.resume or args.run_dir is not None, "--resume", "", "needs --run-dir, the folder to go on in")
     require(args.track_name in TRACKS, "--track-name", args.track_name, f"must be one of {', '.join(TRACKS)}")
     has_rl = args.alpha == 0 or args.demos_rl is not None
-    require(
-        has_rl, "--alpha", args.alpha, "needs --demos-rl, a folder that a script here has written with --save-demos"
+    allowed = (
+        "needs --demos-rl, a folder that ddpg_torcs_like.py or ppo_continuous_kle.py has written with --save-demos"
     )
+    require(has_rl, "--alpha", args.alpha, allowed)
     has_human = args.alpha == 1 or args.demos_human is not None or is_driving(args.env_id)
     require(
         has_human, "--env-id", args.env_id, "needs --demos-human for α < 1; only TorcsLike-v0 has a synthetic human"

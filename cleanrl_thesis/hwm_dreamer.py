@@ -14,10 +14,11 @@ only where a segment begins, w_t with each step. Actor and critic see both, and 
 | Eq. 3.3.9 | − log π · V − η H | the λ-return less the slow critic in the place of V |
 | end of an episode | not in the model | a discount head, as in the baseline |
 | v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all (`--classes 1`: normal) |
-| Z and W | half of S each | `xs` and `s`: 4 and 20 of 24 variables, for y has to show each frame between two reads (not compared with halves yet) |
-| boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; the agents' reads come to almost none, or to a coin's |
+| Z and W | half of S each | `xs`: 4 and 20 of 24 variables, `s`: 8 and 40 of 48, for y has to show each frame between two reads (not compared with halves yet) |
+| boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; where the agents read in the end means little (README) |
 | the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.7); no read or copy is forced within an episode |
-| faithful model | | `--classes 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0 --kl-m-scale 1` |
+| faithful model | | `--size thesis --kl-z-scale 1 --kl-w-scale 1 --kl-m-scale 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0` |
+| Eq. 3.3.8, 3.3.9 | sums over a dream | means, each step weighed by how likely the dream comes to it, and by its discount |
 | acting | not said | m from p(m), z from q where it is read, w from q |
 """
 
@@ -123,7 +124,7 @@ class Args:
     """environment steps"""
     num_envs: int = 10
     """games side by side"""
-    prefill: int = 1_000_000
+    prefill: int | None = None
     """first environment steps, of random play, without updates"""
     train_frequency: int = 5
     """environment steps per update"""
@@ -240,14 +241,14 @@ SIZES = {  # features are as many as the baseline's
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
     | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 64, "gamma": 0.95, "image_scale": 0.25}
     | {"kl_z_scale": 1.0, "kl_w_scale": 1.0, "kl_warmup": 1_000, "entropy_scale": 0.3}
-    | {"reward_scale": 10.0, "tanh_reward": False}
+    | {"reward_scale": 10.0, "tanh_reward": False, "prefill": 1_000_000}
     | {"model_learning_rate": 3e-3, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
     | {"adam_eps": 1e-8, "ent_coef": 3e-3},
     "thesis": {"encoder": "cnn", "frame_side": 64, "depth": 48, "deter_z": 300, "stoch_z": 512, "deter_w": 300}
     | {"stoch_w": 512, "classes": 1, "hidden_size": 600, "head_size": 400, "head_layers": 4, "head_norm": False}
     | {"batch_size": 16, "chunk_length": 50, "rewarded_share": 0.0, "starts": 800, "gamma": 0.999, "image_scale": 1.0}
     | {"kl_z_scale": 0.1, "kl_w_scale": 0.1, "kl_warmup": 0, "entropy_scale": 0.0}
-    | {"reward_scale": 1.0, "tanh_reward": True}
+    | {"reward_scale": 1.0, "tanh_reward": True, "prefill": 50_000}
     | {"model_learning_rate": 2e-4, "actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4}
     | {"adam_eps": 1e-5, "ent_coef": 1e-3},
 }

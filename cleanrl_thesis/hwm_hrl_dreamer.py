@@ -12,7 +12,7 @@ same bytes.
 |---|---|---|
 | skills | "eight rooms" | `--num-skills 8`, one-hot |
 | high-level return | V_λ^{H,τ} over segments | on the clock of the steps: rewards within a segment are summed and discounted, λ counts at its end; a segment that the dream does not finish ends with V^L(w, z, e) |
-| Eq. 3.3.16, 3.3.17 | summed over the decisions | the mean over them, weighed by how likely the dream comes to each |
+| Eq. 3.3.16, 3.3.17 | summed over the decisions | the mean over them, weighed by how likely the dream comes to each, and by its discount |
 | low-level return | V_λ^{L,h} | goes on over the boundaries |
 | a dream that starts within a segment | not said | draws a skill there too, from which π^H and V^H do not learn |
 | boundaries, acting, departures of the model | | as in `hwm_dreamer.py` |
@@ -122,7 +122,7 @@ class Args:
     """environment steps"""
     num_envs: int = 10
     """games side by side"""
-    prefill: int = 1_000_000
+    prefill: int | None = None
     """first environment steps, of random play, without updates"""
     train_frequency: int = 5
     """environment steps per update"""
@@ -241,14 +241,14 @@ SIZES = {  # features are as many as the baseline's
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
     | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 64, "gamma": 0.95, "image_scale": 0.25}
     | {"kl_z_scale": 1.0, "kl_w_scale": 1.0, "kl_warmup": 1_000, "entropy_scale": 0.3}
-    | {"reward_scale": 10.0, "tanh_reward": False}
+    | {"reward_scale": 10.0, "tanh_reward": False, "prefill": 1_000_000}
     | {"model_learning_rate": 3e-3, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
     | {"adam_eps": 1e-8, "ent_coef": 3e-3},
     "thesis": {"encoder": "cnn", "frame_side": 64, "depth": 48, "deter_z": 300, "stoch_z": 512, "deter_w": 300}
     | {"stoch_w": 512, "classes": 1, "hidden_size": 600, "head_size": 400, "head_layers": 4, "head_norm": False}
     | {"batch_size": 16, "chunk_length": 50, "rewarded_share": 0.0, "starts": 800, "gamma": 0.999, "image_scale": 1.0}
     | {"kl_z_scale": 0.1, "kl_w_scale": 0.1, "kl_warmup": 0, "entropy_scale": 0.0}
-    | {"reward_scale": 1.0, "tanh_reward": True}
+    | {"reward_scale": 1.0, "tanh_reward": True, "prefill": 50_000}
     | {"model_learning_rate": 2e-4, "actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4}
     | {"adam_eps": 1e-5, "ent_coef": 1e-3},
 }

@@ -17,8 +17,10 @@ be sent again after every crash: on the same machine the run ends with the same 
 | `--w-reset` | no | yes: w starts anew from z where z is read (VTA) |
 | `--narrow-w`, `--no-decoder-sees-h`, `--no-decoder-sees-c` | no | yes: the decoder sees v and 4 noisy numbers of w in ±1, else w alone carries all and nothing holds a segment |
 | `--budget` | no | the share of steps that may be read, annealed from all; more costs `--budget-price` each |
+| forced reads and copies | no | in training a read after 20 steps without (`--max-segment-length`), and with `--max-segments` copies after so many (VTA) |
+| KL_z prices reads | yes | no (`--detach-kl-z`, VTA) |
 
-The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 without the last three lines:
+The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 but for forced reads and copies and the weights of KL_z and KL_w:
 `--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0
 --read-bias 0 --stoch-w 16 --kl-m-scale 1 --max-segments 10`; rung (g), which draws reads to where z is foretold:
 `--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --foretell-copies 0.1 --total-updates 5000 --budget-updates 3200`, with
@@ -119,7 +121,7 @@ class Args:
 
     # Algorithm
     attempts: int = 1
-    """models trained one after the other, each from weights of its own: that with the greatest J_HWM is kept, and the boundaries on
+    """models trained one after the other, each from weights of its own: that with the greatest J_HWM (`objective`) is kept, and the boundaries on
     which most of them agree are measured too"""
     total_updates: int = 4_000
     """gradient steps of an attempt"""
@@ -132,13 +134,13 @@ class Args:
     max_grad_norm: float = 100.0
     """bound on the norm of the gradient; inf for none"""
     deter_z: int = 64
-    """size of c_t (thesis: 300)"""
+    """size of c_t (the agents' `--size thesis`: 300)"""
     stoch_z: int = 32
-    """size of v_t (thesis: 512)"""
+    """size of v_t (there 512)"""
     deter_w: int = 64
-    """size of h_t (thesis: 300)"""
+    """size of h_t (there 300)"""
     stoch_w: int = 4
-    """size of y_t (thesis: 512)"""
+    """size of y_t (there 512)"""
     hidden_size: int = 128
     """units of hidden layers"""
     std_bias: float = -4.0
@@ -846,7 +848,7 @@ def train_step(model: HWM, optimizer: torch.optim.Adam, data: Sequence, update: 
 
 @torch.no_grad()
 def objective(model: HWM, data: Sequence) -> float:
-    """J_HWM (Eq. 3.3.5, every weight 1) per step of the training data, with m, z and w drawn from q."""
+    """J_HWM per step of the training data, with m, z and w drawn from q: KL terms with weight 1 (Eq. 3.3.5), frames as learned."""
     args, state = model.args, torch.get_rng_state()
     torch.manual_seed(args.seed)
     starts = torch.arange(0, len(data.actions) - args.chunk_length + 1, args.chunk_length)

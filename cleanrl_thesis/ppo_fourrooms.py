@@ -500,7 +500,7 @@ def make_env(env_id: str, render_mode: str | None = None, side: int = 64) -> gym
 # Network
 # ---------------------------------------------------------------------------------------------------------------------
 def orthogonal(layer: nn.Module, gain: float) -> nn.Module:
-    """The layer with orthogonal weights and no bias."""
+    """The layer with orthogonal weights and biases of 0 at first."""
     nn.init.orthogonal_(layer.weight, gain)
     nn.init.zeros_(layer.bias)
     return layer

@@ -104,23 +104,31 @@ def filled(tmp_path: Path, rows: int, spare: int, seed: int = 0) -> tuple[dqn.Re
     return buffer, expected
 
 
+@pytest.mark.parametrize("n_step", [1, 3])
 @pytest.mark.parametrize("rows, spare", [(100, 10), (20, 5)], ids=["all", "the newest"])
-def test_what_is_drawn_is_what_was_seen(rows, spare, tmp_path):
+def test_what_is_drawn_is_what_was_seen(rows, spare, n_step, tmp_path):
     buffer, expected = filled(tmp_path, rows, spare)
     by_frame = {(row, game): (obs, follows) for row, game, obs, follows in expected}
-    minibatch = buffer.sample(4_000, 0.9, np.random.default_rng(1))
+    minibatch = buffer.sample(4_000, 0.9, n_step, np.random.default_rng(1))
     seen = set()
     for obs, action, reward, discount, next_obs in zip(*map(torch.Tensor.tolist, minibatch)):
         row, game = obs[-1]
         wanted, follows = by_frame[row, game]
         assert obs == wanted.tolist() and follows != dqn.NOT_PLAYED
-        assert (action, reward) == (row % 5, row)
-        assert discount == pytest.approx(0.9 if follows == dqn.GOES_ON else 0)
-        assert next_obs == by_frame[row + 1, game][0].tolist()
+        total, weight, end = 0.0, 1.0, row
+        for _ in range(n_step):
+            follows = by_frame[end, game][1]
+            if follows == dqn.NOT_PLAYED:  # a time-out: the value of its last frame
+                break
+            total, weight, end = total + weight * end, (0.9 * weight if follows == dqn.GOES_ON else 0), end + 1
+            if follows == dqn.ENDS:
+                break
+        assert action == row % 5 and (reward, discount) == pytest.approx((total, weight), rel=1e-5)
+        assert next_obs == by_frame[end, game][0].tolist()
         seen.add((row, game))
     first = 0 if rows > FRAMES else FRAMES - rows + STACK - 1
     played = {key for key, (_, follows) in by_frame.items() if follows != dqn.NOT_PLAYED}
-    assert seen == {(row, game) for row, game in played if first <= row < FRAMES - 1}
+    assert seen == {(row, game) for row, game in played if first <= row < FRAMES - n_step}
 
 
 def test_a_million_frames_take_eight_gigabytes():
