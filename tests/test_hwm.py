@@ -205,6 +205,27 @@ def test_loss_is_the_sum_of_its_terms():
     assert loss.item() == pytest.approx(total.item(), rel=1e-5)
 
 
+def test_kl_z_prices_the_reads_unless_it_is_detached():
+    """The loss is the same; q(m) has the gradient of its reads weighed by KL_z (Eq. 3.3.7), or none of it."""
+    data, losses, slopes = make_data([[9], [9]]), [], []
+    for detaches in (True, False):
+        model = make_model(budget_price=0.0, detach_kl_z=detaches)
+        torch.manual_seed(4)
+        loss, _ = method.hwm_loss(model, data, 1.0, 1.0)
+        loss.backward()
+        losses.append(loss.item())
+        slopes.append(model.posterior_m.logit.weight.grad.clone())
+    model.zero_grad()
+    torch.manual_seed(4)
+    made = model.infer(data, "train")
+    normal, kl = torch.distributions.Normal, torch.distributions.kl_divergence
+    kl_z = kl(normal(*made.q_z), normal(*model.prior_z(made.updated))).sum(-1).detach()
+    (0.1 * made.reads * kl_z).mean().backward()
+    wanted = model.posterior_m.logit.weight.grad
+    assert losses[0] == pytest.approx(losses[1], rel=1e-6) and wanted.abs().max() > 1e-6
+    assert torch.allclose(slopes[1] - slopes[0], wanted, rtol=1e-3, atol=1e-7)
+
+
 def test_prices_of_reads():
     data = make_data([[9], [9]])
     torch.manual_seed(4)
@@ -303,6 +324,36 @@ def test_the_price_of_surprise_comes_after_the_budget():
     made = [method.schedule(args, update) for update in (0, 20, 40, 50, 60, 99, 120)]
     assert [budget for _, _, budget, _ in made] == pytest.approx([1, 0.6, 0.2, 0.2, 0.2, 0.2, 0.6])
     assert [price for *_, price in made] == pytest.approx([0, 0, 0, 1.5, 3, 3, 0])
+
+
+def test_learning_rate_and_temperature_of_an_update():
+    args = method.Args(total_updates=1_000, budget_updates=400, learning_rate=1e-2, temperature=0.2)
+    made = [method.schedule(args, update)[:2] for update in (0, 49, 200, 400, 699, 700, 999, 1_000)]
+    rates, temperatures = zip(*made)
+    assert rates == pytest.approx([1e-4, 5e-3, 1e-2, 1e-2, 1e-2, 3e-3, 3e-3, 1e-4])
+    assert temperatures == pytest.approx([1, 1 - 0.8 * 49 / 400, 0.6, 0.2, 0.2, 0.2, 0.2, 1])
+
+
+def test_training_steps_lower_the_loss_at_the_scheduled_rate():
+    args = make_args(total_updates=300, budget_updates=1, batch_size=4, chunk_length=8)
+    torch.manual_seed(0)
+    data = make_data([[9] * 10])
+    data = method.Sequence(data.frames[:, 0].sign(), data.actions[:, 0], data.first[:, 0])
+    model, optimizer = method.new_model(args, data, 3)
+    losses = [method.train_step(model, optimizer, data, update)["loss"].item() for update in range(200)]
+    assert optimizer.param_groups[0]["lr"] == method.schedule(args, 199)[0] == args.learning_rate
+    assert np.mean(losses[-20:]) < 0.8 * np.mean(losses[20:40])
+
+
+@pytest.mark.parametrize("mode", ["posterior", "prior"])
+def test_a_state_knows_no_action_before_it_is_taken(mode):
+    model, data = make_model(), make_data([[9]])
+    actions = data.actions.clone()
+    actions[4] = (actions[4] + 1) % 3
+    one, other = model.infer(data, mode), model.infer(data._replace(actions=actions), mode)
+    for left, right in zip(one.belief[2:], other.belief[2:]):  # w changes with each step
+        assert torch.equal(left[:5], right[:5]) and not torch.equal(left[5], right[5])
+    assert torch.equal(one.p_m[:4], other.p_m[:4]) and not torch.equal(one.p_m[4], other.p_m[4])
 
 
 @pytest.mark.parametrize("flags", [{}, FAITHFUL], ids=["default", "faithful"])

@@ -150,6 +150,57 @@ def test_acting_is_the_inference_of_training_step_by_step():
             assert torch.allclose(part, whole[t], atol=1e-5), t
 
 
+def test_reads_are_those_of_q_and_the_posteriors_see_the_frame():
+    """m_t says whether z is read with the frame of step t + 1; with an episode's first it is anyway."""
+    model, data = make_model(), make_data([[1, 0, 0, 0, 1, 0]])
+    logits = 50 * torch.tensor([[-1.0], [1.0], [-1.0], [1.0], [1.0], [-1.0]])
+    model.posterior_m.forward = lambda embed, first: logits
+    embed = torch.randn(6, 1, 16)
+    inferred = []
+    for change in (0.0, 1.0):
+        embed[3] += change  # z is copied there
+        torch.manual_seed(2)
+        inferred.append(model.observe(embed, one_hot(data.actions), data.first, 0.5))
+    before, after = inferred
+    assert before.reads[:, 0].tolist() == [1, 0, 1, 0, 1, 1] and before.forced[:, 0].tolist() == [1, 0, 0, 0, 1, 0]
+    for q, other in ((before.q_z, after.q_z), (before.q_w, after.q_w)):
+        assert torch.equal(q[0][:3], other[0][:3]) and not torch.isclose(q[0][3], other[0][3]).any()
+
+
+def test_boundaries_drawn_by_gumbel_noise_have_the_probability_of_their_logit():
+    model = make_model()
+    logits = torch.tensor([-2.0, 0.0, 1.5])[:, None].repeat(1, 50_000).requires_grad_()
+    drawn = model.draw_m(logits, 0.5)
+    assert set(drawn.detach().unique().tolist()) <= {0.0, 1.0}
+    assert torch.allclose(drawn.mean(1), torch.sigmoid(logits[:, 0]), atol=0.01)
+    gradient = torch.autograd.grad(drawn.sum(), logits)[0]
+    assert (gradient >= 0).all() and (gradient > 0).float().mean() > 0.5  # of the soft sample
+
+
+@pytest.mark.parametrize("warm", [99, 999])
+def test_kl_z_prices_the_reads_unless_it_is_detached(warm):
+    """The loss is the same; q(m) has the gradient of its reads weighed by KL_z (Eq. 3.3.7), or none of it."""
+    data, losses, slopes = make_data([[1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0]]), [], []
+    changes = {"classes": 1, "budget_price": 0.0, "kl_z_scale": 0.7, "kl_warmup": 1_000, "kl_balance": 0.5}
+    for detaches in (True, False):
+        model = make_model(**changes, detach_kl_z=detaches)
+        torch.manual_seed(5)
+        loss, _, _ = method.world_model_loss(model, data, warm)
+        loss.backward()
+        losses.append(loss.item())
+        slopes.append(model.posterior_m.logit.weight.grad.clone())
+    model.zero_grad()
+    torch.manual_seed(5)
+    embed = model.embedding(model.normalize(data.frames.flatten(0, 1))).unflatten(0, data.first.shape)
+    made = model.observe(embed, one_hot(data.actions), data.first, method.schedule(model.args, warm)[0])
+    normal = torch.distributions.Normal
+    kl_z = torch.distributions.kl_divergence(normal(*made.q_z), normal(*model.prior_z(made.belief.c))).sum(-1)
+    (0.7 * (warm + 1) / 1_000 * made.reads * kl_z.detach()).mean().backward()
+    wanted = model.posterior_m.logit.weight.grad
+    assert losses[0] == pytest.approx(losses[1], rel=1e-6) and wanted.abs().max() > 1e-5
+    assert torch.allclose(slopes[1] - slopes[0], wanted, rtol=1e-3, atol=1e-6)
+
+
 def test_nothing_leaks_over_the_border_of_an_episode():
     """Beliefs, reads and logits of an episode do not change with the frames and actions of the one before."""
     model, data = make_model(), make_data([[1, 0, 0, 1, 0, 0]])
