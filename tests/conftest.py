@@ -12,12 +12,14 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 import unittest.mock
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPT = ROOT / "cleanrl_thesis" / "ppo_continuous_kle.py"
@@ -66,21 +68,67 @@ def as_a_process_of_its_own():
     torch.set_flush_denormal(False)
 
 
+def modified(path: Path) -> int:
+    return path.stat().st_mtime_ns if path.exists() else 0
+
+
 def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:
-    """Start a run that takes about `seconds`, kill it, resume it, and kill it again, both at random moments."""
-    rng, folder, kills, longest = random.Random(seed), Path(flags[flags.index("--run-dir") + 1]), 0, 0.8 * seconds
+    """Start a run that takes about `seconds`, kill it, resume it, and kill it again, each time at a random moment.
+
+    That is within an interval or so of its next checkpoint; with an odd seed the first kill comes before anything is saved.
+    """
+    rng, folder, kills = random.Random(seed), Path(flags[flags.index("--run-dir") + 1]), 0
+    path, longest = folder / "checkpoint.pt", seconds / 10
     while kills < 2:
+        before, early = modified(path), kills == 0 and seed % 2 == 1
         line = command(*flags, "--resume", script=script)
         process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while process.poll() is None and modified(path) in (0, before) and not early:
+            time.sleep(0.005)
         try:
-            process.wait(timeout=rng.uniform(0.5, longest))
+            process.wait(timeout=rng.uniform(0.5, 3) if early else rng.uniform(0, longest))
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
             kills += 1
         else:  # it came to its end first
             shutil.rmtree(folder)
-            kills, longest = 0, 0.7 * longest
+            kills, longest = 0, longest / 2
+
+
+def beliefs_of_play(method, learner, path: Path, steps: int, *extra: float) -> tuple[list, list]:
+    """What a player believed as it played, and what the model infers of the same records of the replay, with the same draws.
+
+    `extra` is given to the model's `observe`. Two lists of states of the games, one for each step.
+    """
+    args, width, looks = learner.args, learner.model.noise(1).shape[-1], []
+    learner.model.noise = lambda *shape: torch.full((*shape, width), 0.5)
+    collector = method.Collector(args, method.Replay(path, args), method.Player(learner, args.num_envs))
+    player, replay, observe = collector.player, collector.replay, collector.player.observe
+
+    def look(frames, begins):
+        observe(frames, begins)
+        looks.append((replay.lengths - 1, player.state))
+
+    player.observe = look
+    collector.reset()
+    for _ in range(steps):
+        collector.step(randomly=False)
+    inferred = []
+    for row, length in zip(replay.rows, replay.lengths):
+        records = row[:length]
+        frames = replay.painter.draw(records["pose"].astype(np.intp), records["goal"].astype(np.intp))
+        actions = F.one_hot(torch.from_numpy(records["action"].astype(np.int64)), 3).float()[:, None]
+        first = torch.from_numpy(records["first"].astype(np.float32))[:, None]
+        with torch.no_grad():
+            embed = learner.model.embedding(learner.model.normalize(torch.from_numpy(frames)))[:, None]
+            inferred.append(learner.model.observe(embed, actions, first, *extra)[0])
+    assert sum((row["first"][:length] > 0).sum() for row, length in zip(replay.rows, replay.lengths)) > args.num_envs
+    belief, wanted = [], []
+    for places, state in looks:
+        belief += [[part[game] for part in state] for game in range(args.num_envs)]
+        wanted += [[part[place, 0] for part in inferred[game]] for game, place in enumerate(places)]
+    return belief, wanted
 
 
 def assert_same_run(left: Path, right: Path) -> None:

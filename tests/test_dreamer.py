@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from conftest import ROOT, kill_twice, needs_compiler, run
+from conftest import ROOT, beliefs_of_play, kill_twice, needs_compiler, run
 
 from cleanrl_thesis import dreamer_v2 as method
 
@@ -148,7 +148,49 @@ def test_random_play_leaves_no_belief(tmp_path):
     assert not collector.begins.any()
 
 
+def test_beliefs_in_play_are_those_of_training(tmp_path):
+    """Over ends of episodes, by the actions that were taken: the model infers the same from the replay."""
+    learner = make_learner(num_envs=5)
+    played, inferred = beliefs_of_play(method, learner, tmp_path / "replay.dat", 130)
+    assert all(torch.allclose(a, b, atol=1e-4) for mine, other in zip(played, inferred) for a, b in zip(mine, other))
+
+
+def test_random_play_then_the_policy_and_updates(tmp_path, monkeypatch):
+    """Which of the two acts on each side of --prefill, and after how many updates the model's losses are told to be."""
+    learner, calls, counts = make_learner(total_timesteps=2_000, train_frequency=50), [], []
+    collector = make_collector(tmp_path, learner, steps=0)
+    for name in ("act", "act_randomly"):
+        plain = getattr(collector.player, name)
+        monkeypatch.setattr(collector.player, name, lambda name=name, plain=plain: calls.append(name) or plain())
+    loss = method.world_model_loss
+    monkeypatch.setattr(method, "world_model_loss", lambda *its: counts.append(its[2]) or loss(*its))
+    for begin in (0, 500):
+        method.run_block(learner, collector, learner.args, begin)
+    assert calls == ["act_randomly"] * 50 + ["act"] * 50 and counts == list(range(10))
+
+
+def test_the_player_draws_or_takes_the_best():
+    learner = make_learner()
+    player = method.Player(learner, 20_000)
+    learner.behaviour.policy = lambda features: torch.tensor([0.2, 0.5, 0.3]).log().expand(len(features), 3)
+    assert (player.act(greedy=True) == 1).all() and player.action[:, 1].all()
+    actions = player.act()
+    assert np.allclose(np.bincount(actions) / 20_000, [0.2, 0.5, 0.3], atol=0.015)
+    assert np.array_equal(player.action.argmax(1), actions)
+
+
 # The model
+def test_the_cell_keeps_its_state_by_its_update_gate():
+    """Gate by gate, in numpy: gates of the normalised sums, the update's less 1, as in DreamerV2."""
+    torch.manual_seed(0)
+    cell, x, state = method.GRUCell(3, 4), torch.randn(2, 3), torch.randn(2, 4)
+    sums = np.concatenate([x, state], 1) @ cell.linear.weight.detach().numpy().T
+    sums = (sums - sums.mean(1, keepdims=True)) / np.sqrt(sums.var(1, keepdims=True) + 1e-5)
+    reset, candidate, update = sums[:, :4], sums[:, 4:8], 1 / (1 + np.exp(1 - sums[:, 8:]))
+    expected = update * np.tanh(candidate / (1 + np.exp(-reset))) + (1 - update) * state.numpy()
+    assert np.allclose(cell(x, state).detach(), expected, atol=1e-5)
+
+
 def test_tiles_are_squares_of_two_by_two_pixels():
     """The encoder is a convolution of stride 2; the decoder puts each tile where the encoder has it."""
     torch.manual_seed(0)
@@ -350,6 +392,52 @@ def test_actions_are_scored_at_the_states_where_they_are_taken():
     log_policy = behaviour.actor(features[:-1]).log_softmax(-1)[..., 1]  # advantages 0.9 and 1, weights 1 and 0.9
     expected = -(log_policy[0] * 0.9 + 0.9 * log_policy[1] * 1.0).sum() / 2
     assert loss.item() == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_losses_of_actor_and_critic():
+    """Step by step: later ones count as much as the dream is likely to come there, discounted; entropy is a gain."""
+    torch.manual_seed(0)
+    behaviour = method.Behaviour(make_args(), Chain())
+    for module in behaviour.parts().values():
+        wake(module)
+    behaviour.copy_critics()
+    wake(behaviour.critic.append(torch.nn.Linear(1, 1)))  # other than the slow one
+    features, actions = torch.randn(4, 3, 5), F.one_hot(torch.randint(2, (3, 3)), 2).float()
+    rewards, discounts = torch.randn(3, 3), 0.3 + 0.6 * torch.rand(3, 3)
+    losses, _ = method.behaviour_loss(behaviour, method.Dream(features, actions, rewards, discounts), 0.8, 0.1)
+    slow, actor, critic = behaviour.slow_value(features), 0.0, 0.0
+    for n in range(3):
+        weight = 1.0
+        for h in range(3):
+            target = slow[3, n]
+            for k in reversed(range(h, 3)):
+                target = rewards[k, n] + discounts[k, n] * (0.2 * slow[k + 1, n] + 0.8 * target)
+            policy = torch.distributions.Categorical(logits=behaviour.policy(features[h, n]))
+            gain = policy.log_prob(actions[h, n].argmax()) * (target - slow[h, n]) + 0.1 * policy.entropy()
+            actor -= weight * gain / 9
+            critic += weight * 0.5 * (behaviour.value(features[h, n]) - target) ** 2 / 9
+            weight *= discounts[h, n]
+    assert losses["actor"].item() == pytest.approx(actor.item(), rel=1e-4)
+    assert losses["critic"].item() == pytest.approx(critic.item(), rel=1e-4)
+
+
+def test_each_part_has_its_own_rate():
+    rates = {"model_learning_rate": 1e-3, "actor_learning_rate": 2e-3, "critic_learning_rate": 3e-3}
+    optimizers = make_learner(**rates, adam_eps=1e-7, weight_decay=1e-4).optimizers
+    for name, (rate, eps) in {"model": (1e-3, 1e-5), "actor": (2e-3, 1e-7), "critic": (3e-3, 1e-7)}.items():
+        (group,) = optimizers[name].param_groups
+        assert (group["lr"], group["eps"]) == (rate, eps) and group["lr"] * group["weight_decay"] == pytest.approx(1e-4)
+
+
+def test_dreams_start_at_states_that_do_not_end_an_episode():
+    learner = make_learner(starts=8)
+    terminals = torch.zeros(4, 5)
+    terminals[1, 2] = terminals[3] = 1
+    names = torch.arange(20.0).view(4, 5, 1)
+    drawn = [learner.draw_starts(method.State(names, -names), terminals) for _ in range(100)]
+    assert all(torch.equal(each.stoch, -each.deter) and len(each.stoch.unique()) == 8 for each in drawn)
+    alive = set(range(20)) - {7, 15, 16, 17, 18, 19}
+    assert set(torch.cat([each.stoch for each in drawn]).int().flatten().tolist()) == alive
 
 
 def test_critic_and_actor_on_a_chain():
@@ -604,6 +692,66 @@ def test_the_dream_starts_from_what_was_seen(small_run, tmp_path):
     truth, dream = method.dream_frames(learner, learner.args, states, np.array([1, 1, 1, 1]))
     assert truth.shape == dream.shape == (5, 22, 22, 3) and truth.dtype == dream.dtype == np.uint8
     assert np.array_equal(truth, method.painter(11, 22).draw(4 * states[:, 0] + states[:, 1], states[:, 2]))
+    wake(learner.model)
+    dreams = []
+    for changed in (None, 1, 3):  # the model sees three frames
+        other = states.copy()
+        if changed is not None:
+            other[changed, 0] = 30
+        torch.manual_seed(0)
+        dreams.append(method.dream_frames(learner, learner.args, other, np.array([1, 1, 1, 1]))[1])
+    assert not np.array_equal(dreams[1][3:], dreams[0][3:]) and np.array_equal(dreams[2], dreams[0])
+
+
+class Shortest:
+    """Reads a game's state from its frame and goes a shortest way."""
+
+    greedy: list[bool] = []
+
+    def __init__(self, learner, num_games: int):
+        maze = method.maze(11)
+        poses, goals = (grid.ravel() for grid in np.meshgrid(np.arange(len(maze.moves)), np.unique(maze.starts[:, 1])))
+        frames = method.painter(11, 22).draw(poses, goals)
+        self.state_of = {frame.tobytes(): state for frame, state in zip(frames, zip(poses, goals))}
+        self.after = method.fewest_steps(maze)[maze.moves]  # (poses, actions, goals)
+
+    def observe(self, frames: np.ndarray, begins: np.ndarray) -> None:
+        self.states = [self.state_of[frame.tobytes()] for frame in frames]
+
+    def act(self, greedy: bool = False) -> np.ndarray:
+        self.greedy.append(greedy)
+        return np.array([self.after[pose, :, goal].argmin() for pose, goal in self.states])
+
+
+@pytest.mark.parametrize("greedy", [True, False])
+def test_returns_of_an_evaluation_are_those_of_each_first_episode(greedy, monkeypatch):
+    """Games that have ended go on until the last one has; what they earn then does not count."""
+    monkeypatch.setattr(method, "Player", Shortest)
+    monkeypatch.setattr(Shortest, "greedy", [])
+    learner = make_learner()
+    played = method.play(learner, learner.args, list(range(30)), greedy)
+    poses, goals = 4 * played["starts"][:, 0] + played["starts"][:, 1], played["starts"][:, 2]
+    steps = method.fewest_steps(method.maze(11))[poses, goals]
+    assert np.allclose(played["returns"], 1 - 0.9 * steps / 100) and played["solved"].all()
+    assert len(played["actions"]) == steps[0] == len(played["states"]) - 1
+    assert steps.max() > 2 * steps.min() and set(Shortest.greedy) == {greedy}
+
+
+@pytest.mark.parametrize("tanh", [True, False])
+def test_dreamed_returns_are_undiscounted_over_an_episodes_length(tanh, monkeypatch):
+    """Rewards count as far as the dream is likely to come, and as they are where the model learns their tanh."""
+    learner, asked = make_learner(tanh_reward=tanh), []
+    rewards, goes_on = torch.tensor([[0.1, 0.2], [0.3, 0.4]]), torch.tensor([[0.5, 1.0], [0.0, 1.0]])
+
+    def imagine(model, behaviour, state, horizon, gamma):
+        asked.append((len(state.features()), horizon, gamma))
+        return method.Dream(torch.zeros(3, 2, 1), torch.zeros(2, 2, 3), rewards, goes_on)
+
+    monkeypatch.setattr(method, "imagine", imagine)
+    paid = rewards.atanh() if tanh else rewards
+    expected = [paid[0, 0] + 0.5 * paid[1, 0], paid[0, 1] + paid[1, 1]]
+    assert np.allclose(method.dreamed_returns(learner, learner.args, [1, 2]), expected, atol=1e-5)
+    assert asked == [(2, 100, 1.0)]
 
 
 # The report

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from conftest import ROOT, assert_refused, command, edit_manifest, kill_twice, rewrite, run
+from conftest import ROOT, assert_refused, command, edit_manifest, kill_twice, modified, rewrite, run
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
@@ -266,10 +266,6 @@ def assert_same_run(left: Path, right: Path) -> None:
             assert torch.equal(value, states[1][part][name]), name
     for mine, other in zip(*(state["optimizer"]["state"].values() for state in states)):
         assert all(torch.equal(value, other[name]) for name, value in mine.items())
-
-
-def modified(path: Path) -> int:
-    return path.stat().st_mtime_ns if path.exists() else 0
 
 
 def kill(flags: list, folder: Path, number: int) -> None:

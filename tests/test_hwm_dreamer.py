@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from conftest import ROOT, kill_twice, needs_compiler, run
+from conftest import ROOT, beliefs_of_play, kill_twice, needs_compiler, run
 from test_dreamer import assert_same_states
 
 from cleanrl_thesis import dreamer_v2
@@ -148,6 +148,15 @@ def test_acting_is_the_inference_of_training_step_by_step():
         state, *_ = model.filter(state, one_hot(data.actions[t]), data.first[t, :, None], embed[t], noise[t])
         for part, whole in zip(state, made.belief):
             assert torch.allclose(part, whole[t], atol=1e-5), t
+
+
+def test_beliefs_in_play_are_those_of_training(tmp_path):
+    """Over ends of episodes, by the actions that were taken; with intervals, for m is drawn from p in play and from q here."""
+    args = make_args(num_envs=5, fixed_interval=4)
+    torch.manual_seed(0)
+    learner = method.Learner(args, method.HWM(args, 3), CPU)
+    played, inferred = beliefs_of_play(method, learner, tmp_path / "replay.dat", 130, 1.0)
+    assert all(torch.allclose(a, b, atol=1e-4) for mine, other in zip(played, inferred) for a, b in zip(mine, other))
 
 
 def test_reads_are_those_of_q_and_the_posteriors_see_the_frame():

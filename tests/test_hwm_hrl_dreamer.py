@@ -201,6 +201,21 @@ def test_information_of_the_skill():
     assert method.skill_information(behaviour, features).item() == pytest.approx(0, abs=1e-6)
     behaviour.policy = lambda features, skill: 40 * skill
     assert method.skill_information(behaviour, features).item() == pytest.approx(np.log(2), abs=1e-4)
+    behaviour.high_policy = lambda features: torch.tensor([0.9, 0.1]).log().expand(len(features), 2)
+    entropy = -(0.9 * np.log(0.9) + 0.1 * np.log(0.1))  # a skill that is seldom drawn says little
+    assert method.skill_information(behaviour, features).item() == pytest.approx(entropy, abs=1e-4)
+
+
+def test_the_player_acts_by_its_skill():
+    args = make_args(num_skills=3)
+    torch.manual_seed(0)
+    learner = method.Learner(args, method.HWM(args, 3), CPU)
+    learner.behaviour.high_policy = lambda features: torch.tensor([[0.0, 0.0, 0.0]]).expand(len(features), 3)
+    learner.behaviour.policy = lambda features, skill: 40 * skill
+    player = method.Player(learner, 500)
+    player.observe(np.zeros((500, 22, 22, 3), np.uint8), np.ones(500, bool))
+    actions = player.act()
+    assert np.array_equal(actions, player.skill.argmax(1)) and np.bincount(actions).min() > 100
 
 
 def test_the_player_keeps_its_skill_until_z_is_read(tmp_path):
