@@ -445,8 +445,37 @@ def test_the_decoder_sees_what_it_is_told_to(part):
 
 
 def test_narrow_w():
-    made = make_model(narrow_w=True, narrow_std=0.3).infer(make_data([[30]]), "train")
-    assert (made.q_w.mean.abs() <= 1).all() and (made.q_w.std == 0.3).all()
+    model = make_model(narrow_w=True, narrow_std=0.3)
+    with torch.no_grad():
+        model.posterior_w.layers[-1].weight.mul_(100)
+    made = model.infer(make_data([[30]]), "train")
+    assert 0.9 < made.q_w.mean.abs().max() <= 1 and (made.q_w.std == 0.3).all()
+
+
+@pytest.mark.parametrize("mode", ["posterior", "prior"])
+def test_what_is_measured_of_an_episode(mode):
+    """m_t beside the step after it, z and w of each step, none of the zeros behind a shorter episode."""
+    model, names = make_model(frame_size=12), np.arange(10.0).reshape(5, 2)
+    rows = torch.from_numpy(names)[..., None].float()  # (T, B, 1), a number for each step of each episode
+    belief = method.Belief(rows, rows + 100, rows + 200, rows + 300)
+    reads = (torch.arange(10).view(5, 2) % 3 == 0).float()
+    made = model.infer(make_data([[5], [5]], 12), "posterior")
+    made = made._replace(belief=belief, reads=reads, q_m=rows[..., 0] + 400, p_m=rows[..., 0] + 500)
+    model.infer = lambda data, asked: made if asked == mode else None
+    model.decode = lambda belief: torch.zeros(5, 2, 12)
+    episodes = [
+        method.Episode(np.full((n, 2, 2, 3), 51.0, np.float32), np.zeros(n, int), np.zeros((n, 3)), np.zeros(n))
+        for n in (5, 3)
+    ]
+    normalizer = method.Normalizer(np.full((2, 2, 3), 0.3), np.ones(3))
+    found = method.segment(model, episodes, normalizer, mode, torch.device("cpu"))
+    steps = [names[:5, 0], names[:3, 1]]
+    assert [part.tolist() for part in found.found] == [[bool(n % 3 == 0) for n in part[1:]] for part in steps]
+    logits = 400 if mode == "posterior" else 500
+    assert found.scores.tolist() == [n + logits for part in steps for n in part[:-1]]
+    assert found.z.tolist() == [[n, n + 100] for part in steps for n in part]
+    assert found.w.tolist() == [[n + 200, n + 300] for part in steps for n in part]
+    assert found.error == pytest.approx(0.01, rel=1e-4)  # 0.3 where 51 / 255 = 0.2 was seen
 
 
 @pytest.mark.parametrize(("before", "after"), [(0, 0), (1, 1), (2, 2), (1, 0), (0, 2)])
