@@ -4,14 +4,15 @@
 # the teacher takes about 3 hours of a core; its replay takes 8 GB of disk.
 #   benchmark/gopher_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
+#   THREADS=2 benchmark/gopher_alpha.sh     the teacher with two threads
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/gopher}
-OUT=${OUT:-benchmark/results/gopher}
+OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1}
 ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
 TEMPERATURES=${TEMPERATURES-0.1 0 1} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0 0.5}
 mkdir -p "$RUNS"
-"$PYTHON" cleanrl_thesis/dqn_gopher.py --bf16 --save-model --run-dir "$RUNS/teacher_seed1" --resume
+"$PYTHON" cleanrl_thesis/dqn_gopher.py --bf16 --num-threads "$THREADS" --save-model --run-dir "$RUNS/teacher_seed1" --resume
 student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
   echo --seed "$1" --alpha "$2" --run-dir "$RUNS/$3_seed$1" "${@:4}"
 }
