@@ -454,3 +454,42 @@ def test_gpu_gives_the_numbers_of_the_cpu():
         agents.append(agent.cpu())
     for p, q in zip(*(agent.parameters() for agent in agents)):
         torch.testing.assert_close(p, q, rtol=1e-3, atol=1e-4)
+
+
+class Counter(gym.Env):
+    """Observes its step; pays 1 a step and ends after 4, by a time-out in every second episode."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    episodes = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.step_number, self.episodes = 0, self.episodes + 1
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.step_number += 1
+        over, times_out = self.step_number == 4, self.episodes % 2 == 0
+        return np.full(1, self.step_number, np.float32), 1.0, over and not times_out, over and times_out, {}
+
+
+def test_ends_time_outs_returns_and_noise_of_a_rollout():
+    """Both end an episode, a time-out alone has a last observation; returns are raw; noise has the policy's deviation."""
+    args = make_args(num_steps=16, total_timesteps=160, norm_divisor="variance")
+    agent = make_agent(args, 1, 1)
+    with torch.no_grad():
+        agent.actor_logstd.fill_(-1.0)
+    collector = ppo.Collector([Counter()], args)
+    collector.start()
+    rollout = collector.collect(agent)
+    assert np.flatnonzero(rollout.dones[:, 0]).tolist() == [3, 7, 11, 15]
+    assert [t for t, _, _ in rollout.time_outs] == [7, 15]
+    assert rollout.episodes == [(4, 4.0, 4), (8, 4.0, 4), (12, 4.0, 4), (16, 4.0, 4)]
+    noise = np.random.default_rng(np.random.SeedSequence(args.seed)).standard_normal((16, 1, 1), np.float32)
+    with torch.no_grad():
+        mean = agent.actor_mean(torch.from_numpy(rollout.obs[:16])).numpy()
+    assert np.allclose((rollout.actions - mean) / math.exp(-1), noise, atol=1e-4)
+    collector.update_agent_statistics(agent)
+    assert np.allclose(agent.obs_divisor, collector.obs_stats.divisor("variance"))
+    assert np.allclose(agent.obs_mean, collector.obs_stats.mean)

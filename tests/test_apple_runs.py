@@ -449,3 +449,51 @@ def test_a_teacher_and_its_student_play_well(tmp_path):
     assert results[0]["mean"] > 30
     assert results[1]["greedy"]["mean"] > 21
     assert results[1]["sampled"]["mean"] > 25
+
+
+def test_what_is_tested_on_is_not_trained_on(tmp_path, monkeypatch):
+    trained, tested, shares = [], [], set()
+    epoch, measure, draw = distill.train_epoch, distill.measure, distill.draw_masks
+    monkeypatch.setattr(distill, "train_epoch", lambda *its: trained.append((its[1].he_obs, its[2])) or epoch(*its))
+    monkeypatch.setattr(distill, "measure", lambda *its: tested.append(its[1].he_obs) or measure(*its))
+    monkeypatch.setattr(distill, "draw_masks", lambda shape, share: shares.add(share) or draw(shape, share))
+    run(*SMALL_DISTILL, "--alpha", 0, "--epochs", 1, "--run-dir", "run", cwd=tmp_path, script=DISTILL)
+    obs, indices = trained[0]
+    assert len(tested[0]) == 500 and len(indices) == 2_500 and shares == {0.5}
+
+    def frames(x: torch.Tensor) -> list[bytes]:
+        return sorted(row.tobytes() for row in x.numpy())
+
+    assert frames(torch.cat([obs[indices], tested[0]])) == frames(obs)
+
+
+def test_exploration_of_the_dqn_falls_over_its_share(tmp_path, monkeypatch):
+    """And with ε = 1 the network is never asked."""
+    durations, schedule = set(), dqn.linear_schedule
+    monkeypatch.setattr(dqn, "linear_schedule", lambda *its: durations.add(its[:3]) or schedule(*its))
+    flags = ["--total-timesteps", 3_000, "--start-e", 1, "--end-e", 1, "--run-dir", "run"]
+
+    def never(agent):
+        def ask(obs):
+            assert (tmp_path / "run" / "episodes.csv").exists() and len(obs) > 1, "asked in training"
+            return np.zeros(len(obs), int)
+
+        return ask
+
+    monkeypatch.setattr(dqn, "numpy_greedy", never)
+    run(*SMALL_DQN, *flags, cwd=tmp_path, script=DQN)
+    assert durations == {(1.0, 1.0, 0.1 * 3_000)}
+
+
+def test_no_game_serves_two_purposes(teacher, student):
+    """Training and evaluation of the DQN; the human's, the student's evaluation and its demonstrations."""
+    scored = set(json.loads((teacher / "evaluation.json").read_text())["seeds"])
+    assert not scored & {dqn.episode_seed(1, i, n) for i in range(2) for n in range(1_000)}
+    sets = [set(json.loads((student / "evaluation.json").read_text())["seeds"])]
+    for name in ("demos", "demos_synthetic_human"):
+        sets.append(set())
+        for path in (student / name).glob("*.npz"):
+            with np.load(path) as arrays:
+                sets[-1].add(int(arrays["seed"]))
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        assert sets[one] and not sets[one] & sets[other]

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import safetensors.torch
+import torch
 from conftest import SMALL, command, run
 
 from cleanrl_thesis import ppo_continuous_kle as ppo
@@ -314,3 +315,23 @@ def test_several_environments_share_the_batch(tmp_path):
     assert (args["num_steps"], args["batch_size"], args["minibatch_size"]) == (512, 2048, 64)
     returns = ppo.read_episodes(tmp_path / "run")[:, 1]
     assert len(returns) == 4 * (1024 // 200) and len(set(returns)) == len(returns)
+
+
+def test_adam_gets_the_annealed_rates(tmp_path, monkeypatch):
+    """Not only the record: ten iterations of two epochs of eight minibatches."""
+    rates, step = [], ppo.adam_step
+    monkeypatch.setattr(ppo, "adam_step", lambda *its: rates.append(its[4].max().item()) or step(*its))
+    run(*SMALL, "--run-dir", "run", cwd=tmp_path)
+    args = json.loads((tmp_path / "run" / "args.json").read_text())
+    assert np.allclose(rates, np.repeat(args["learning_rate"] * (1 - np.arange(10) / 10), 16), rtol=1e-5)
+
+
+def test_the_agent_has_the_statistics_of_its_collector(small_run):
+    state = torch.load(small_run / "checkpoint.pt", weights_only=True)
+    mean = state["collector"]["obs_stats"]["mean"]
+    assert np.allclose(state["agent"]["obs_mean"], mean) and np.abs(mean).max() > 1e-3
+
+
+def test_evaluation_plays_no_episode_of_the_training(small_run):
+    scored = set(json.loads((small_run / "evaluation.json").read_text())["seeds"])
+    assert scored and not scored & {ppo.episode_seed(1, 0, n) for n in range(1_000)}

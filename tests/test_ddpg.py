@@ -354,3 +354,18 @@ def test_the_best_policy_is_kept(monkeypatch):
     assert best.last_score == 4
     obs = np.ones((2, OBS), np.float32)
     assert np.allclose(update.norm(obs), (obs - scales[1][0].numpy()) / scales[1][1].numpy())
+
+
+def test_returns_of_the_cars_are_those_of_their_episodes():
+    players = ddpg.CarPlayers(ddpg.TorcsLikeVectorEnv(3), 5)
+    players.start()
+    rng, totals, lengths, ends = np.random.default_rng(0), np.zeros(3), np.zeros(3, int), 0
+    for _ in range(600):
+        steps = players.step(rng.uniform([0.0, 0.2], [0.3, 1.0], (3, 2)))
+        totals += steps.rewards
+        lengths += 1
+        for i, episodic_return, length in steps.ended:
+            assert (episodic_return, length) == (pytest.approx(totals[i]), lengths[i])
+            totals[i] = lengths[i] = 0
+            ends += 1
+    assert ends > 3

@@ -2,6 +2,7 @@
 
 import csv
 import importlib
+import itertools
 import json
 import shutil
 import signal
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 from conftest import ROOT, assert_refused, command, edit_manifest, flip_a_byte, kill_twice, needs_compiler, rewrite, run
 
@@ -317,3 +319,83 @@ def test_eight_runs_killed_at_random_end_with_the_same_bytes(kind, expert, tmp_p
 
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(kill_and_resume, range(8)))
+
+
+def test_the_kept_policy_is_evaluated_and_saved(tmp_path, monkeypatch):
+    consider = ddpg.Best.consider
+    at_2000 = lambda best, agent, score, step: consider(best, agent, score, step) if step == 2_000 else None  # noqa: E731
+    monkeypatch.setattr(ddpg.Best, "consider", at_2000)
+    run(*SMALL_DDPG, "--save-model", "--run-dir", "run", cwd=tmp_path, script=DDPG)
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    agent = ddpg.Agent(65, 2, 16, True)
+    agent.load_state_dict(safetensors.torch.load_file(tmp_path / "run" / "model.safetensors"))
+    saved = torch.cat([parameter.detach().reshape(-1) for parameter in agent.actor.parameters()])
+    assert torch.equal(saved, state["best"]["actor"])
+    assert not torch.equal(saved, state["optimizer"]["vector"][: len(saved)])
+
+
+def replayed(folder: Path, width: int) -> np.ndarray:
+    """The transitions in the replay buffer of a run that has not gone round."""
+    added = torch.load(folder / "checkpoint.pt", weights_only=True)["added"]
+    return np.fromfile(folder / "replay.dat", np.float32).reshape(-1, width)[:added]
+
+
+def test_what_is_replayed(expert, tmp_path):
+    """No value behind a crash, one behind a time-out; rewards times --reward-scale."""
+    discounts = replayed(expert, 2 * 65 + 2 + 2)[:, 65 + 2 + 1]
+    crashes = (expert / "episodes.csv").read_text().count("\n") - 1  # 1,600 steps of each car: too few for a time-out
+    assert (discounts == 0).sum() == crashes > 0 and np.allclose(discounts[discounts > 0], 0.99)
+    flags = ["--env-id", "Pendulum-v1", "--keep-best-every", 0, "--reward-scale", 0.1, "--buffer-size", 9_000]
+    run(*SMALL_DDPG, *flags, "--run-dir", "run", cwd=tmp_path, script=DDPG)
+    rows, episodes = replayed(tmp_path / "run", 9), ddpg.read_episodes(tmp_path / "run")
+    assert np.allclose(rows[:, 5], 0.99) and len(episodes) == 40
+    assert rows[:, 4].sum() == pytest.approx(0.1 * episodes[:, 1].sum(), rel=1e-4)
+
+
+def test_the_experts_are_in_their_places(expert, tmp_path, monkeypatch):
+    """The first, whose weight is α, is that of --demos-rl, the second the human."""
+    seen = []
+    monkeypatch.setattr(gail, "behaviour_cloning", lambda agent, experts, args: seen.append(experts))
+    flags = ["--demos-rl", expert / "demos", "--total-timesteps", 0, "--run-dir", "run"]
+    run(*SMALL_GAIL, *flags, cwd=tmp_path, script=GAIL)
+    for expert_demos, folder in zip(seen[0], (expert / "demos", tmp_path / "run" / "demos_synthetic_human")):
+        with np.load(folder / "episode_00000.npz") as arrays:
+            first = arrays["actions"][::2].astype(np.float32).clip(-1, 1)
+        assert np.allclose(expert_demos.actions[: len(first)], first)
+
+
+def test_the_kl_bound_falls_and_the_discriminator_learns_every_third_time(expert, tmp_path, monkeypatch):
+    bounds, rounds = [], []
+    step, update = gail.trpo_step, gail.update_discriminator
+    monkeypatch.setattr(gail, "trpo_step", lambda *its: bounds.append(its[2]) or step(*its))
+    monkeypatch.setattr(gail, "update_discriminator", lambda *its: rounds.append(len(bounds)) or update(*its))
+    flags = ["--demos-rl", expert / "demos", "--run-dir", "run"]
+    run(*SMALL_GAIL, *flags, cwd=tmp_path, script=GAIL)
+    args = gail.Args()
+    assert np.allclose(bounds, args.max_kl * (1 - np.arange(20) / 20)) and args.g_steps == 3
+    assert [number for number in rounds if number] == [3, 6, 9, 12, 15, 18]
+
+
+def seeds_of(folder: Path) -> set[int]:
+    """Of the demonstrations in a folder."""
+    found = set()
+    for path in folder.glob("*.npz"):
+        with np.load(path) as arrays:
+            found.add(int(arrays["seed"]))
+    return found
+
+
+def test_no_game_serves_two_purposes(student, tmp_path, monkeypatch):
+    """Training, the choice of the policy, evaluation and demonstrations have episodes of their own; so has the student."""
+    played, play = [], ddpg.play
+    monkeypatch.setattr(ddpg, "play", lambda *its, **more: played.append(set(its[2])) or play(*its, **more))
+    run(*SMALL_DDPG, "--save-demos", 2, "--run-dir", "run", cwd=tmp_path, script=DDPG)
+    *chosen, scored, shown = played
+    training = {ddpg.episode_seed(1, i, n) for i in range(5) for n in range(1_000)}
+    for one, other in itertools.combinations((training, set().union(*chosen), scored, shown), 2):
+        assert one and not one & other
+    scored = set(json.loads((student / "evaluation.json").read_text())["seeds"])
+    training = {gail.episode_seed(1, i, n) for i in range(4) for n in range(1_000)}
+    others = (training, scored, seeds_of(student / "demos"), seeds_of(student / "demos_synthetic_human"))
+    for one, other in itertools.combinations(others, 2):
+        assert one and not one & other

@@ -343,3 +343,117 @@ def test_behaviour_cloning_mixes_two_actions_into_one_between_them():
     assert means.mean().item() == pytest.approx(0.4, abs=0.03) and means.std() < 0.1
     spread = 0.8 * 2 * (0.25 * 0.75) ** 0.5  # deviation of a coin between both
     assert agent.actor_logstd.exp().item() == pytest.approx(spread, rel=0.1)
+
+
+# From the demonstrations to the update
+SPACE = gym.spaces.Box(-1, 1, (1,))
+
+
+def one_action(action: float) -> gail.Demonstrations:
+    """An expert who always does the same."""
+    episode = {"observations": np.zeros((101, OBS), np.float32), "actions": np.full((100, 1), action, np.float32)}
+    return gail.Demonstrations([episode], SPACE, 1)
+
+
+def of_student(action: float, size: int) -> gail.Batch:
+    actions = torch.full((size, 1), action)
+    return gail.Batch(torch.zeros(size, OBS), actions, actions, torch.zeros(size), torch.zeros(size))
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0])
+def test_alpha_is_the_weight_of_the_reinforcement_learning_expert(alpha):
+    """The discriminator takes for the student's (logit above 0) what the expert without weight does, not the other's."""
+    torch.manual_seed(0)
+    agent = gail.Agent(OBS, 1, 32)
+    adam, args = torch.optim.Adam(agent.discriminator.parameters(), 1e-3), gail.Args(alpha=alpha, d_grad_penalty=0.0)
+    for _ in range(600):
+        gail.update_discriminator(
+            agent, adam, of_student(0.0, 500), gail.Experts(one_action(1.0), one_action(-1.0)), args
+        )
+    rl, human = (agent.logits(torch.tensor([[0.0] * OBS + [action]])).item() for action in (1.0, -1.0))
+    assert (rl < 0 < human) if alpha else (human < 0 < rl)
+
+
+def test_each_experts_penalty_has_its_weight(monkeypatch):
+    torch.manual_seed(0)
+    agent, losses = gail.Agent(OBS, 1, 32), []
+    experts, adam = (
+        gail.Experts(one_action(1.0), one_action(-1.0)),
+        torch.optim.SGD(agent.discriminator.parameters(), 0.0),
+    )
+    plain = gail.discriminator_loss
+    monkeypatch.setattr(
+        gail, "gradient_penalty", lambda logits, student, expert: expert[0, -1].clamp(min=0)
+    )  # 1 of RL's
+    backward = torch.Tensor.backward
+    monkeypatch.setattr(torch.Tensor, "backward", lambda loss: losses.append(loss.item()) or backward(loss))
+    monkeypatch.setattr(gail, "discriminator_loss", lambda *its: (0 * plain(*its)[0], {}))
+    gail.update_discriminator(
+        agent, adam, of_student(0.0, 50), experts, gail.Args(alpha=0.3, d_grad_penalty=2.0, d_steps=1)
+    )
+    assert losses == pytest.approx([2 * 0.3])
+
+
+def test_a_batch_by_hand():
+    """Rewards and values of what the environment had, actions within bounds; time-outs are no ends."""
+    torch.manual_seed(0)
+    agent, args = gail.Agent(OBS, 1, 8), gail.Args(gamma=0.9, gae_lambda=0.8)
+    agent.set_normalisation(1 + torch.randn(99, OBS))
+    obs, next_obs = np.random.default_rng(0).standard_normal((2, 3, 2, OBS)).astype(np.float32)
+    ended, terminated = np.zeros((2, 3, 2), bool)
+    ended[0, 1] = ended[1, 0] = terminated[0, 1] = True
+    rollout = gail.Rollout(obs, np.full((3, 2, 1), 3, np.float32), next_obs, terminated, ended, [])
+    rewards = gail.pay(agent, rollout, SPACE, "positive", torch.device("cpu"))
+    logits = agent.logits(agent.pairs(torch.from_numpy(obs).flatten(0, 1), torch.ones(6, 1)))
+    assert np.allclose(rewards.ravel(), -torch.sigmoid(logits).log().detach(), atol=1e-5)
+    batch = gail.make_batch(agent, rollout, rewards, SPACE, args, torch.device("cpu"))
+    with torch.no_grad():
+        flat = (agent.normalise(torch.from_numpy(each).flatten(0, 1)) for each in (obs, next_obs))
+        values, next_values = (agent.value(each).numpy().reshape(3, 2) for each in flat)
+    advantages = np.zeros((3, 2))
+    for i in range(2):
+        following = 0.0
+        for t in reversed(range(3)):
+            delta = rewards[t, i] + 0.9 * next_values[t, i] * (not terminated[t, i]) - values[t, i]
+            following = delta + 0.9 * 0.8 * following * (not ended[t, i])
+            advantages[t, i] = following
+    assert np.allclose(batch.returns, (advantages + values).ravel(), atol=1e-5)
+    scaled = (advantages - advantages.mean()) / advantages.std()
+    assert np.allclose(batch.advantages, scaled.ravel(), atol=1e-4)
+    assert (batch.seen == 1).all() and (batch.actions == 3).all()
+
+
+def test_the_critic_learns_the_returns():
+    torch.manual_seed(0)
+    agent, args = gail.Agent(OBS, 1, 32), gail.Args(batch_size=256)
+    obs = torch.randn(256, OBS)
+    returns = 3 + obs[:, 0]
+    batch = gail.Batch(obs, obs[:, :1], obs[:, :1], -returns, returns)
+    optimizer = torch.optim.Adam(agent.critic.parameters(), 1e-2)
+    losses = [gail.update_values(agent, optimizer, batch, args) for _ in range(60)]
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_the_student_acts_as_it_is_trained():
+    """In rollouts and in evaluation: the mean of normalised observations, and noise of the policy's deviation."""
+    torch.manual_seed(0)
+    agent, space = gail.Agent(65, 2, 8), gym.spaces.Box(-9, 9, (2,))
+    agent.set_normalisation(3 + 2 * torch.randn(500, 65))
+    with torch.no_grad():
+        agent.actor_logstd.fill_(-1.0)
+        agent.actor_mean[4].weight.mul_(50)
+    obs = 3 + 8 * torch.randn(4_000, 65)
+    with torch.no_grad():
+        mean = agent.actor_mean(agent.normalise(obs)).numpy()
+    assert np.allclose(gail.make_policy(agent, "greedy", space, 0)(obs.numpy()), mean, atol=1e-4)
+    noise = gail.make_policy(agent, "sampled", space, 0)(obs.numpy()) - mean
+    assert noise.std() == pytest.approx(math.exp(-1), rel=0.03)
+    args = gail.Args(num_envs=3, num_steps=4, frame_skip=1)
+    players = gail.make_players(args)
+    players.start()
+    rollout = gail.collect(agent, players, gail.make_env(args.env_id).action_space, args, np.random.default_rng(0))
+    with torch.no_grad():
+        mean = agent.actor_mean(agent.normalise(torch.from_numpy(rollout.obs))).numpy()
+    rng = np.random.default_rng(0)
+    noise = np.stack([rng.standard_normal((3, 2), np.float32) for _ in range(4)])
+    assert np.allclose((rollout.actions - mean) / math.exp(-1), noise, atol=1e-3)
