@@ -68,11 +68,28 @@ def as_a_process_of_its_own():
     torch.set_flush_denormal(False)
 
 
+def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:
+    """Start a run that takes about `seconds`, kill it, resume it, and kill it again, both at random moments."""
+    rng, folder, kills, longest = random.Random(seed), Path(flags[flags.index("--run-dir") + 1]), 0, 0.8 * seconds
+    while kills < 2:
+        line = command(*flags, "--resume", script=script)
+        process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            process.wait(timeout=rng.uniform(0.5, longest))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            kills += 1
+        else:  # it came to its end first
+            shutil.rmtree(folder)
+            kills, longest = 0, 0.7 * longest
+
+
 def modified(path: Path) -> int:
     return path.stat().st_mtime_ns if path.exists() else 0
 
 
-def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:
+def kill_after_checkpoints(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:
     """Start a run that takes about `seconds`, kill it, resume it, and kill it again, each time at a random moment.
 
     That is within an interval or so of its next checkpoint; with an odd seed the first kill comes before anything is saved.

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, flip_a_byte, kill_twice, needs_compiler, rewrite, run
+from conftest import ROOT, flip_a_byte, kill_after_checkpoints, needs_compiler, rewrite, run
 from safetensors.torch import load_file
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import mannwhitneyu
@@ -662,7 +662,7 @@ def test_objective_is_eq_3_3_5_with_every_weight_1():
 def test_killed_runs_end_with_the_same_bytes(demos, tmp_path, seed):
     flags = [*SMALL, "--total-updates", 150, "--seed", seed, "--demos", str(demos)]
     run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
-    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 15, seed, SCRIPT)
+    kill_after_checkpoints([*flags, "--run-dir", str(tmp_path / "run")], 15, seed, SCRIPT)
     run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert_same_states(tmp_path / "whole", tmp_path / "run")
 
