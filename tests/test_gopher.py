@@ -432,7 +432,7 @@ def test_runs_killed_at_random_end_with_the_same_bytes(small, tmp_path):
 @pytest.mark.timeout(1800)
 def test_it_learns_from_the_memory(tmp_path):
     """Random play gets 335 points; 2,000,000 frames bring five times as many (benchmark/gopher_ram.sh)."""
-    flags = ["--obs-type", "ram", "--n-step", 3, "--life-loss-ends", "--anneal-lr", "--total-timesteps", 600_000]
+    flags = ["--obs-type", "ram", "--n-step", 3, "--life-loss-ends", "--anneal-lr", "--total-timesteps", 1_000_000]
     run(*flags, "--eval-episodes", 30, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
     assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["mean"] > 750
 
