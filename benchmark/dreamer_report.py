@@ -178,6 +178,24 @@ def table(rows: list[dict], agents: dict = AGENTS) -> list[str]:
     return lines
 
 
+def differences(rows: list[dict]) -> list[str]:
+    """Each agent less the one before it, with Welch's 95% interval; empty where one of them has a single seed."""
+    lines = []
+    for later, earlier in (("hwm", "dreamer"), ("hrl", "hwm")):
+        cells = []
+        for name, digits in (("steps_to_0.5", 0), ("last_200", 3), ("greedy", 3)):
+            groups = [[row[name] for row in rows if row["agent"] == agent] for agent in (later, earlier)]
+            if min(map(len, groups)) > 1 and not np.isnan(groups[0] + groups[1]).any():
+                low, high = stats.ttest_ind(*groups, equal_var=False).confidence_interval()
+                cells.append(
+                    f"{np.mean(groups[0]) - np.mean(groups[1]):+,.{digits}f} [{low:+,.{digits}f}, {high:+,.{digits}f}]"
+                )
+        if len(cells) == 3:
+            lines.append(f"| {AGENTS[later][0]} less {AGENTS[earlier][0]} | {' | '.join(cells)} |")
+    head = ["", "| 95% by Welch | steps to 0.5 | last 200 episodes | greedy |", "|" + "---|" * 4]
+    return head + lines if lines else []
+
+
 def curves_figure(runs: list[dict], agents: dict, title: str) -> Figure:
     """Fig. 3.5: the mean over seeds of the moving means, and their range, up to where the shortest run has come."""
     figure = Figure(figsize=(8, 4.5), layout="constrained")
@@ -219,7 +237,7 @@ def write_report(runs: list[dict], out: Path) -> None:
     play = " or ".join(f"{steps:,}" for steps in sorted({row["prefill"] for row in rows}, reverse=True))
     about = f"{made_at or 'runs that go on'}; this report at {commit()}. One thread each. Steps from the first update on, after {play}"
     text = [f"`benchmark/fourrooms.sh`, {about} of random play.", ""]
-    text += table(rows)
+    text += table(rows) + differences(rows)
     curves_figure(runs, AGENTS, "Fig. 3.5").savefig(out / "fig_3_5.png", dpi=110)
     if any(row["agent"] not in AGENTS for row in rows):
         text += ["", "## What the baseline needs", "", *table(rows, CAUSES)]

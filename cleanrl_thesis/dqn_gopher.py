@@ -227,9 +227,8 @@ def complete_args(args: Args) -> Args:
     args.num_iterations = args.total_timesteps // frames
     allowed = f"must be at least one step of every game, {frames} frames"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
-    least = (
-        args.frame_stack + args.n_step + 1
-    ) * args.num_envs  # of two rows to draw from, one may begin no transition
+    rows = args.frame_stack + args.n_step + 1  # of two to draw from, one may begin no transition
+    least = rows * args.num_envs
     allowed = f"must be at least --frame-stack, --n-step and one more frames of every game, {least}"
     require(args.buffer_size >= least, "--buffer-size", args.buffer_size, allowed)
     if args.track and importlib.util.find_spec("wandb") is None:

@@ -20,7 +20,8 @@ be sent again after every crash: on the same machine the run ends with the same 
 | forced reads and copies | no | in training a read after 20 steps without (`--max-segment-length`), and with `--max-segments` copies after so many (VTA) |
 | KL_z prices reads | yes | no (`--detach-kl-z`, VTA) |
 
-The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 but for forced reads and copies and the weights of KL_z and KL_w:
+The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 but for forced reads and copies and the
+weights of KL_z and KL_w:
 `--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0
 --read-bias 0 --stoch-w 16 --kl-m-scale 1 --max-segments 10`; rung (g), which draws reads to where z is foretold:
 `--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --foretell-copies 0.1 --total-updates 5000 --budget-updates 3200`, with
@@ -121,8 +122,8 @@ class Args:
 
     # Algorithm
     attempts: int = 1
-    """models trained one after the other, each from weights of its own: that with the greatest J_HWM (`objective`) is kept, and the boundaries on
-    which most of them agree are measured too"""
+    """models trained one after the other, each from weights of its own: that with the greatest J_HWM (`objective`) is kept, and the
+    boundaries on which most of them agree are measured too"""
     total_updates: int = 4_000
     """gradient steps of an attempt"""
     batch_size: int = 16

@@ -16,6 +16,7 @@ import time
 import unittest.mock
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -68,49 +69,70 @@ def as_a_process_of_its_own():
     torch.set_flush_denormal(False)
 
 
-def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:
-    """Start a run that takes about `seconds`, kill it, resume it, and kill it again, both at random moments."""
-    rng, folder, kills, longest = random.Random(seed), Path(flags[flags.index("--run-dir") + 1]), 0, 0.8 * seconds
-    while kills < 2:
-        line = command(*flags, "--resume", script=script)
-        process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            process.wait(timeout=rng.uniform(0.5, longest))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            kills += 1
-        else:  # it came to its end first
-            shutil.rmtree(folder)
-            kills, longest = 0, 0.7 * longest
+def ends_before_it_is_killed(process: subprocess.Popen, seconds: float) -> bool:
+    """Kill a process after so many seconds; return whether it came to its end first."""
+    try:
+        process.wait(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return False
+    return True
 
 
 def modified(path: Path) -> int:
     return path.stat().st_mtime_ns if path.exists() else 0
 
 
-def kill_after_checkpoints(flags: list, seconds: float, seed: int, script: Path = SCRIPT) -> None:
-    """Start a run that takes about `seconds`, kill it, resume it, and kill it again, each time at a random moment.
+def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT, after_checkpoints: bool = False) -> None:
+    """Start a run that takes about `seconds`, kill it, resume it, and kill it again, both at random moments.
 
-    That is within an interval or so of its next checkpoint; with an odd seed the first kill comes before anything is saved.
+    With `after_checkpoints` these are within an interval or so of its next checkpoint, but for the first kill of an odd seed,
+    which comes before anything is saved.
     """
     rng, folder, kills = random.Random(seed), Path(flags[flags.index("--run-dir") + 1]), 0
-    path, longest = folder / "checkpoint.pt", seconds / 10
+    path, longest = folder / "checkpoint.pt", seconds * (0.1 if after_checkpoints else 0.8)
     while kills < 2:
-        before, early = modified(path), kills == 0 and seed % 2 == 1
+        waits, before = after_checkpoints and not (kills == 0 and seed % 2), modified(path)
         line = command(*flags, "--resume", script=script)
         process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while process.poll() is None and modified(path) in (0, before) and not early:
+        while waits and process.poll() is None and modified(path) in (0, before):
             time.sleep(0.005)
-        try:
-            process.wait(timeout=rng.uniform(0.5, 3) if early else rng.uniform(0, longest))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            kills += 1
-        else:  # it came to its end first
+        low, high = (0.5, 3.0) if after_checkpoints else (0.5, longest)
+        if ends_before_it_is_killed(process, rng.uniform(0, longest) if waits else rng.uniform(low, high)):
             shutil.rmtree(folder)
-            kills, longest = 0, longest / 2
+            kills, longest = 0, 0.7 * longest
+        else:
+            kills += 1
+
+
+class Counter(gym.Env):
+    """Observes its step; pays 1 a step and ends after 4, by a time-out in every second episode."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    episodes = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.step_number, self.episodes = 0, self.episodes + 1
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.step_number += 1
+        over, times_out = self.step_number == 4, self.episodes % 2 == 0
+        return np.full(1, self.step_number, np.float32), 1.0, over and not times_out, over and times_out, {}
+
+
+def assert_boundaries_follow_their_logits(model) -> None:
+    """Drawn by Gumbel noise: each with the probability of its logit, and with the gradient of the soft sample."""
+    torch.manual_seed(0)
+    logits = torch.tensor([-2.0, 0.0, 1.5])[:, None].repeat(1, 50_000).requires_grad_()
+    drawn = model.draw_m(logits, 0.5)
+    assert set(drawn.detach().unique().tolist()) <= {0.0, 1.0}
+    assert torch.allclose(drawn.mean(1), torch.sigmoid(logits[:, 0]), atol=0.01)
+    gradient = torch.autograd.grad(drawn.sum(), logits)[0]
+    assert (gradient >= 0).all() and (gradient > 0).float().mean() > 0.5
 
 
 def beliefs_of_play(method, learner, path: Path, steps: int, *extra: float) -> tuple[list, list]:

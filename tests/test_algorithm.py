@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import needs_compiler
+from conftest import Counter, needs_compiler
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.running_mean_std import RunningMeanStd as SB3RunningMeanStd
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
@@ -454,24 +454,6 @@ def test_gpu_gives_the_numbers_of_the_cpu():
         agents.append(agent.cpu())
     for p, q in zip(*(agent.parameters() for agent in agents)):
         torch.testing.assert_close(p, q, rtol=1e-3, atol=1e-4)
-
-
-class Counter(gym.Env):
-    """Observes its step; pays 1 a step and ends after 4, by a time-out in every second episode."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    episodes = 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.step_number, self.episodes = 0, self.episodes + 1
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.step_number += 1
-        over, times_out = self.step_number == 4, self.episodes % 2 == 0
-        return np.full(1, self.step_number, np.float32), 1.0, over and not times_out, over and times_out, {}
 
 
 def test_ends_time_outs_returns_and_noise_of_a_rollout():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import torch
-from conftest import needs_compiler
+from conftest import Counter, needs_compiler
 
 from cleanrl_thesis import ddpg_torcs_like as ddpg
 
@@ -212,24 +212,6 @@ def test_the_ring_keeps_the_last_transitions(tmp_path):
     assert scipy.stats.chisquare(counts).pvalue > 1e-3
     again = ddpg.ReplayBuffer(tmp_path / "replay.dat", capacity=10, spare=4, width=8, added=36)
     assert np.array_equal(again.array, buffer.array)
-
-
-class Counter(gym.Env):
-    """Observes its step; ends after 4 steps, by a time-out in every second episode."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    episodes = 0
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.step_number, self.episodes = 0, self.episodes + 1
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.step_number += 1
-        over, times_out = self.step_number == 4, self.episodes % 2 == 0
-        return np.full(1, self.step_number, np.float32), 1.0, over and not times_out, over and times_out, {}
 
 
 def test_players_return_the_real_next_observation_and_go_on():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from conftest import ROOT, beliefs_of_play, kill_after_checkpoints, needs_compiler, run
+from conftest import ROOT, beliefs_of_play, kill_twice, needs_compiler, run
 
 from cleanrl_thesis import dreamer_v2 as method
 
@@ -680,7 +680,7 @@ def test_losses_that_explode_end_the_run(tmp_path):
 def test_killed_runs_end_with_the_same_bytes(tmp_path, seed):
     flags = [*SMALL, "--total-timesteps", 5_000, "--seed", seed]
     run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
-    kill_after_checkpoints([*flags, "--run-dir", str(tmp_path / "run")], 12, seed, SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 12, seed, SCRIPT, after_checkpoints=True)
     run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert_same_states(tmp_path / "whole", tmp_path / "run")
 

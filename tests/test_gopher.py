@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from conftest import ROOT, assert_refused, command, edit_manifest, kill_after_checkpoints, modified, rewrite, run
+from conftest import ROOT, assert_refused, command, edit_manifest, kill_twice, modified, rewrite, run
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
 
@@ -423,7 +423,7 @@ def test_a_resume_with_other_hyperparameters_names_them(small, tmp_path, capsys)
 def test_runs_killed_at_random_end_with_the_same_bytes(small, tmp_path):
     for seed in range(6):
         flags = [*SMALL, "--run-dir", tmp_path / f"run{seed}"]
-        kill_after_checkpoints(flags, 12, seed, SCRIPT)
+        kill_twice(flags, 12, seed, SCRIPT, after_checkpoints=True)
         run(*flags, "--resume", cwd=tmp_path, script=SCRIPT)
         assert_same_run(small, tmp_path / f"run{seed}")
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, flip_a_byte, kill_after_checkpoints, needs_compiler, rewrite, run
+from conftest import ROOT, assert_boundaries_follow_their_logits, flip_a_byte, kill_twice, needs_compiler, rewrite, run
 from safetensors.torch import load_file
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import mannwhitneyu
@@ -126,14 +126,7 @@ def test_standard_deviations():
 
 
 def test_boundaries_drawn_by_gumbel_noise_have_the_probability_of_their_logit():
-    model = make_model()
-    torch.manual_seed(0)
-    logits = torch.tensor([-2.0, 0.0, 1.5])[:, None].repeat(1, 50_000).requires_grad_()
-    drawn = model.draw_m(logits, 0.5)
-    assert set(drawn.detach().unique().tolist()) <= {0.0, 1.0}
-    assert torch.allclose(drawn.mean(1), torch.sigmoid(logits[:, 0]), atol=0.01)
-    gradient = torch.autograd.grad(drawn.sum(), logits)[0]
-    assert (gradient >= 0).all() and (gradient > 0).float().mean() > 0.5  # of the soft sample
+    assert_boundaries_follow_their_logits(make_model())
 
 
 @pytest.mark.parametrize("flags", [{}, FAITHFUL], ids=["default", "faithful"])
@@ -662,7 +655,7 @@ def test_objective_is_eq_3_3_5_with_every_weight_1():
 def test_killed_runs_end_with_the_same_bytes(demos, tmp_path, seed):
     flags = [*SMALL, "--total-updates", 150, "--seed", seed, "--demos", str(demos)]
     run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
-    kill_after_checkpoints([*flags, "--run-dir", str(tmp_path / "run")], 15, seed, SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 15, seed, SCRIPT, after_checkpoints=True)
     run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert_same_states(tmp_path / "whole", tmp_path / "run")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from conftest import ROOT, beliefs_of_play, kill_after_checkpoints, needs_compiler, run
+from conftest import ROOT, assert_boundaries_follow_their_logits, beliefs_of_play, kill_twice, needs_compiler, run
 from test_dreamer import assert_same_states
 
 from cleanrl_thesis import dreamer_v2
@@ -177,13 +177,7 @@ def test_reads_are_those_of_q_and_the_posteriors_see_the_frame():
 
 
 def test_boundaries_drawn_by_gumbel_noise_have_the_probability_of_their_logit():
-    model = make_model()
-    logits = torch.tensor([-2.0, 0.0, 1.5])[:, None].repeat(1, 50_000).requires_grad_()
-    drawn = model.draw_m(logits, 0.5)
-    assert set(drawn.detach().unique().tolist()) <= {0.0, 1.0}
-    assert torch.allclose(drawn.mean(1), torch.sigmoid(logits[:, 0]), atol=0.01)
-    gradient = torch.autograd.grad(drawn.sum(), logits)[0]
-    assert (gradient >= 0).all() and (gradient > 0).float().mean() > 0.5  # of the soft sample
+    assert_boundaries_follow_their_logits(make_model())
 
 
 @pytest.mark.parametrize("warm", [99, 999])
@@ -409,6 +403,6 @@ def test_compiled_and_plain_agree():
 def test_killed_runs_end_with_the_same_bytes(tmp_path, seed):
     flags = [*SMALL, "--total-timesteps", 5_000, "--seed", seed]
     run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
-    kill_after_checkpoints([*flags, "--run-dir", str(tmp_path / "run")], 14, seed, SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 14, seed, SCRIPT, after_checkpoints=True)
     run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert_same_states(tmp_path / "whole", tmp_path / "run")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from conftest import ROOT, kill_after_checkpoints, needs_compiler, run
+from conftest import ROOT, kill_twice, needs_compiler, run
 from test_dreamer import assert_same_states
 from test_hwm_dreamer import SMALL, TINY, make_data
 
@@ -278,6 +278,6 @@ def test_compiled_and_plain_agree():
 def test_a_killed_run_ends_with_the_same_bytes(tmp_path):
     flags = [*SMALL, "--total-timesteps", 5_000]
     run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
-    kill_after_checkpoints([*flags, "--run-dir", str(tmp_path / "run")], 14, 0, SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 14, 0, SCRIPT, after_checkpoints=True)
     run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert_same_states(tmp_path / "whole", tmp_path / "run")

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, kill_after_checkpoints, needs_compiler, run
+from conftest import ROOT, kill_twice, needs_compiler, run
 
 from cleanrl_thesis import ppo_fourrooms as method
 
@@ -250,7 +250,7 @@ def test_copied_alone(small_run, tmp_path):
 def test_killed_runs_end_with_the_same_bytes(tmp_path, seed):
     flags = [*SMALL, "--total-timesteps", 25_600, "--seed", seed]
     run(*flags, "--run-dir", tmp_path / "whole", cwd=tmp_path, script=SCRIPT)
-    kill_after_checkpoints([*flags, "--run-dir", str(tmp_path / "run")], 12, seed, SCRIPT)
+    kill_twice([*flags, "--run-dir", str(tmp_path / "run")], 12, seed, SCRIPT, after_checkpoints=True)
     run(*flags, "--run-dir", tmp_path / "run", "--resume", cwd=tmp_path, script=SCRIPT)
     assert_same_states(tmp_path / "whole", tmp_path / "run")
 
