@@ -93,13 +93,12 @@ def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT, af
     rng, folder, kills = random.Random(seed), Path(flags[flags.index("--run-dir") + 1]), 0
     path, longest = folder / "checkpoint.pt", seconds * (0.1 if after_checkpoints else 0.8)
     while kills < 2:
-        waits, before = after_checkpoints and not (kills == 0 and seed % 2), modified(path)
+        early, before = after_checkpoints and kills == 0 and seed % 2 == 1, modified(path)
         line = command(*flags, "--resume", script=script)
         process = subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while waits and process.poll() is None and modified(path) in (0, before):
+        while after_checkpoints and not early and process.poll() is None and modified(path) in (0, before):
             time.sleep(0.005)
-        low, high = (0.5, 3.0) if after_checkpoints else (0.5, longest)
-        if ends_before_it_is_killed(process, rng.uniform(0, longest) if waits else rng.uniform(low, high)):
+        if ends_before_it_is_killed(process, rng.uniform(0.5, 3) if early else rng.uniform(0, longest)):
             shutil.rmtree(folder)
             kills, longest = 0, 0.7 * longest
         else:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import scipy.stats
 import torch
 import torch.nn.functional as F
 from conftest import ROOT, beliefs_of_play, kill_twice, needs_compiler, run
@@ -818,6 +819,23 @@ def test_goals_by_what_the_replay_paid(small_run, capsys):
         dreamer_goals.main(dreamer_goals.Args(small_run.parent))
     with pytest.raises(SystemExit, match="whose model has no segments"):
         dreamer_reads.main(dreamer_reads.Args(small_run))
+
+
+def test_differences_of_agents():
+    """Welch's interval, by its formula; none where an agent has one seed."""
+    values = {"dreamer": (0.7, 0.8, 0.84), "hwm": (0.6, 0.75, 0.72), "hrl": (0.7,)}
+    names = ("steps_to_0.5", "last_200", "greedy")
+    rows = [{"agent": agent, **dict.fromkeys(names, value)} for agent, many in values.items() for value in many]
+    a, b = (np.array(values[agent]) for agent in ("hwm", "dreamer"))
+    shares = a.var(ddof=1) / 3, b.var(ddof=1) / 3
+    freedom = sum(shares) ** 2 / (shares[0] ** 2 / 2 + shares[1] ** 2 / 2)
+    half, mean = scipy.stats.t.ppf(0.975, freedom) * sum(shares) ** 0.5, a.mean() - b.mean()
+    (line,) = dreamer_report.differences(rows)[3:]
+    assert (
+        line.endswith(f"| {mean:+.3f} [{mean - half:+.3f}, {mean + half:+.3f}] |")
+        and "HWM Dreamer less Dreamer" in line
+    )
+    assert dreamer_report.differences(rows[2:]) == []
 
 
 def test_moving_mean():
