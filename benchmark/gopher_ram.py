@@ -79,7 +79,7 @@ def curves(runs: list[Path], random: float) -> Figure:
     )
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(loc="lower right", fontsize="small")
+    figure.legend(loc="outside right center", fontsize="small")
     return figure
 
 
