@@ -77,6 +77,7 @@ def curves(runs: list[Path], random: float) -> Figure:
         ylabel="points of a game",
         ylim=(0, None),
     )
+    axes.locator_params(axis="x", nbins=5)
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside right center", fontsize="small")
