@@ -179,9 +179,9 @@ def table(rows: list[dict], agents: dict = AGENTS) -> list[str]:
 
 
 def differences(rows: list[dict]) -> list[str]:
-    """Each agent less the one before it, with Welch's 95% interval; empty where one of them has a single seed."""
+    """Each agent less the one that it adds to, with Welch's 95% interval; empty where one of them has a single seed."""
     lines = []
-    for later, earlier in (("hwm", "dreamer"), ("hrl", "hwm")):
+    for later, earlier in (("hwm", "dreamer"), ("hrl", "hwm"), ("hwm_fixed", "hwm"), ("hrl_fixed", "hrl")):
         cells = []
         for name, digits in (("steps_to_0.5", 0), ("last_200", 3), ("greedy", 3)):
             groups = [[row[name] for row in rows if row["agent"] == agent] for agent in (later, earlier)]
