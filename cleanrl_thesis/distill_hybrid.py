@@ -25,7 +25,7 @@ again after every crash: on the same machine the run ends with the same bytes.
 Demonstrations of Atari hold seeds and actions; their frames, 28 kB each as stacks of four, are made again in memory (1.6 GB, for
 a moment twice that).
 People play frame by frame (`record_human.py`): each of their frames is one to learn from, seen as an agent would see it there.
-The number of rewards in each life, the unit in which Table 2.2 seems to count (see the README), is in `evaluation.json` beside
+The number of rewards in each life, the unit in which Table 2.2 seems to count (`benchmark/results/README.md`), is in `evaluation.json` beside
 the points.
 """
 
@@ -1427,7 +1427,7 @@ def play_together(policy, games: list[AtariGame], seeds: list[int]) -> list[dict
 
 
 def rewards_per_life(episode: dict[str, np.ndarray]) -> list[int]:
-    """How many rewards there were in each life of an episode: as Table 2.2 seems to count, see the README."""
+    """How many rewards there were in each life of an episode: as Table 2.2 seems to count (`benchmark/results/README.md`)."""
     lost = np.flatnonzero(np.diff(episode["lives"]) < 0) + 2  # behind the step in which it was lost
     return [int((part > 0).sum()) for part in np.split(episode["rewards"], lost) if len(part)]
 

@@ -912,7 +912,7 @@ def evaluate(agent: AtariQNetwork, args: Args, run_dir: Path, device: torch.devi
 
 
 def rewards_per_life(episode: dict[str, np.ndarray]) -> list[int]:
-    """How many rewards there were in each life of an episode: as Table 2.2 seems to count, see the README."""
+    """How many rewards there were in each life of an episode: as Table 2.2 seems to count (`benchmark/results/README.md`)."""
     lost = np.flatnonzero(np.diff(episode["lives"]) < 0) + 2  # behind the step in which it was lost
     return [int((part > 0).sum()) for part in np.split(episode["rewards"], lost) if len(part)]
 

@@ -15,7 +15,7 @@ only where a segment begins, w_t with each step. Actor and critic see both, and 
 | end of an episode | not in the model | a discount head, as in the baseline |
 | v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all (`--classes 1`: normal) |
 | Z and W | half of S each | `xs`: 4 and 20 of 24 variables, `s`: 8 and 40 of 48, for y has to show each frame between two reads (not compared with halves yet) |
-| boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; where the agents read in the end means little (README) |
+| boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; where the agents read in the end means little (`benchmark/results/README.md`) |
 | the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.7); no read or copy is forced within an episode |
 | faithful model | | `--size thesis --kl-z-scale 1 --kl-w-scale 1 --kl-m-scale 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0` |
 | Eq. 3.3.8, 3.3.9 | sums over a dream | means, each step weighed by how likely the dream comes to it, and by its discount |

@@ -66,6 +66,21 @@ def test_package_is_importable_from_anywhere(tmp_path):
     assert done.stdout == "kle/Thrower-v2\n", done.stderr
 
 
+def anchors(page: str) -> set[str]:
+    """What GitHub makes of a page's headings to link to."""
+    titles = re.findall(r"^#+ (.*)$", page, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", ["README.md", "benchmark/results/README.md"])
+def test_every_link_leads_somewhere(page):
+    text = (ROOT / page).read_text()
+    for target, anchor in re.findall(r"\]\(([^)#]*)#?([^)]*)\)", text):
+        assert "://" in target or ((ROOT / page).parent / target).exists(), target
+        if anchor:
+            assert anchor in anchors((((ROOT / page).parent / target) if target else ROOT / page).read_text()), anchor
+
+
 def example_commands() -> list[str]:
     """`NAME.py FLAGS` of every command that the README or a method's docstring shows."""
     texts = [(ROOT / "README.md").read_text(), *(ast.get_docstring(ast.parse(path.read_text())) for path in METHODS)]
