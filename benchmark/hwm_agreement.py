@@ -82,11 +82,11 @@ def segment(run: Path) -> tuple[list[np.ndarray], list[hwm.Episode]]:
     """What the model of a run finds in the held-out episodes, m from p (section 3.5.1), and these."""
     args = read_args(run)
     episodes, _ = hwm.read_split(args)
-    mean = np.concatenate([episode.frames for episode in episodes.training]).mean(0) / 255
-    normalizer = hwm.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32))
-    model = hwm.HWM(args, mean.size, max(int(episode.actions.max()) for episode in episodes.training) + 1)
-    model.load_state_dict(safetensors.torch.load_file(run / "model.safetensors"))
-    return hwm.segment(model, episodes.heldout, normalizer, "prior", torch.device("cpu")).found, episodes.heldout
+    parameters = safetensors.torch.load_file(run / "model.safetensors")
+    num_actions = max(int(episode.actions.max()) for episode in episodes.training) + 1
+    model = hwm.HWM(args, parameters["frame_mean"].numpy(), num_actions)
+    model.load_state_dict(parameters)
+    return hwm.segment(model, episodes.heldout, "prior", torch.device("cpu")).found, episodes.heldout
 
 
 def offsets(found: list[np.ndarray], rooms: list[np.ndarray]) -> np.ndarray:

@@ -114,7 +114,8 @@ class Args:
     heldout_episodes: int = 400
     """episodes held out, at most"""
     heldout_demos: Path | None = None
-    """folder whose episodes are held out, where those to train on are of another player; default: the rest of `--demos`"""
+    """folder whose episodes are held out, where those to train on are of another player: those after its first `--train-pairs`
+    pairs, from which the probes learn; default: the rest of `--demos`"""
     frame_side: int = 22
     """pixels of the frames' side, to which the recorded ones are shrunk; two for each cell of the 11 × 11 maze"""
     red_scale: float = 5.0
@@ -323,11 +324,13 @@ def read_demonstrations(folder: Path, side: int, flag: str = "--demos") -> tuple
     return [read_episode(folder / name, checksum, side, flag) for name, checksum in sorted(files.items())], recorded
 
 
-def split_episodes(episodes: list[Episode], args: Args) -> tuple[list[Episode], list[Episode]]:
+def split_episodes(
+    episodes: list[Episode], args: Args, flag: str = "--demos"
+) -> tuple[list[Episode], list[Episode]]:
     """The first episodes with `--train-pairs` steps, and those held out after them. Raises UsageError where there are too few."""
     ends = np.cumsum([len(episode.actions) for episode in episodes])
     first = int(np.searchsorted(ends, args.train_pairs)) + 1
-    allowed = f"must leave at least one episode to hold out; the demonstrations have {ends[-1]} pairs"
+    allowed = f"must leave at least one episode of {flag} to hold out; it has {ends[-1]} pairs"
     require(first < len(episodes), "--train-pairs", args.train_pairs, allowed)
     enough = args.chunk_length < ends[first - 1]
     require(enough, "--chunk-length", args.chunk_length, f"must be less than the {ends[first - 1]} steps to train on")
@@ -350,14 +353,14 @@ def read_split(args: Args) -> tuple[Split, str]:
     if args.heldout_demos is not None:
         others, other_id = read_demonstrations(args.heldout_demos, args.frame_side, "--heldout-demos")
         require(other_id == env_id, "--heldout-demos", args.heldout_demos, f"must be of {env_id}, is of {other_id}")
-        probed, heldout = split_episodes(others, args)
+        probed, heldout = split_episodes(others, args, "--heldout-demos")
     return Split(training, probed[:400], heldout), env_id
 
 
 class Normalizer(NamedTuple):
     """Frames <-> what the model sees: the mean frame subtracted, red scaled, flat."""
 
-    mean: np.ndarray  # (side, side, 3)
+    mean: np.ndarray  # (side, side, 3) in 0 to 1
     scale: np.ndarray  # (3,)
 
     def normalize(self, frames: np.ndarray) -> np.ndarray:
@@ -392,7 +395,7 @@ def in_a_row(episodes: list[Episode], normalizer: Normalizer) -> Sequence:
 
 
 def side_by_side(episodes: list[Episode], normalizer: Normalizer) -> Sequence:
-    """Episodes side by side, zeros behind the shorter ones."""
+    """Episodes side by side; behind the shorter ones zeros, each the beginning of an episode, so that q(m) ends before them."""
     steps = max(len(episode.actions) for episode in episodes)
     frames = np.zeros((steps, len(episodes), normalizer.mean.size), np.float32)
     actions, first = np.zeros((steps, len(episodes)), np.int64), np.zeros((steps, len(episodes)), np.float32)
@@ -400,6 +403,7 @@ def side_by_side(episodes: list[Episode], normalizer: Normalizer) -> Sequence:
     for i, episode in enumerate(episodes):
         frames[: len(episode.actions), i] = normalizer.normalize(episode.frames)
         actions[: len(episode.actions), i] = episode.actions
+        first[len(episode.actions) :, i] = 1
     return Sequence(*(torch.from_numpy(array) for array in (frames, actions, first)))
 
 
@@ -494,6 +498,11 @@ class Posterior(nn.Module):
         return self.bound * torch.tanh(logit / self.bound) if self.bound else logit
 
 
+def uniforms(*shape: int, device: torch.device) -> torch.Tensor:
+    """Uniform numbers, drawn on the CPU: one random state to restore."""
+    return torch.rand(shape).to(device)
+
+
 class Belief(NamedTuple):
     """z_t = [c_t, v_t] and w_t = [h_t, y_t]."""
 
@@ -519,9 +528,10 @@ class Inference(NamedTuple):
 class HWM(nn.Module):
     """The generative process of Eq. 3.3.1 and the variational distributions of Eq. 3.3.2."""
 
-    def __init__(self, args: Args, frame_size: int, num_actions: int):
+    def __init__(self, args: Args, frame_mean: np.ndarray, num_actions: int):
         super().__init__()
-        self.args, self.num_actions = args, num_actions
+        self.args, self.num_actions, frame_size = args, num_actions, frame_mean.size
+        self.register_buffer("frame_mean", torch.tensor(np.ascontiguousarray(frame_mean), dtype=torch.float32))
         dz, sz, dw, sw, hidden = args.deter_z, args.stoch_z, args.deter_w, args.stoch_w, args.hidden_size
         z, w, embed = dz + sz, dw + sw, hidden
         self.encoder = mlp(frame_size, hidden, embed)
@@ -536,6 +546,10 @@ class HWM(nn.Module):
         self.prior_m = mlp(w + z + num_actions, hidden, 1, 2)  # p(m_t | w_t, z_t, a_t)
         self.decoder = mlp(w + z, hidden, frame_size)  # p(o_t | w_t, z_t)
 
+    def normalizer(self) -> Normalizer:
+        """What the model's frames are made with."""
+        return Normalizer(self.frame_mean.cpu().numpy(), np.array([self.args.red_scale, 1, 1], np.float32))
+
     def low_level(self, head: NormalHead, features: torch.Tensor) -> Normal:
         """The head's distribution; with `--narrow-w` its mean lies in ±1 and the posterior's σ is fixed."""
         mean, std = head(features)
@@ -546,7 +560,7 @@ class HWM(nn.Module):
 
     def draw_m(self, logits: torch.Tensor, temperature: float) -> torch.Tensor:
         """Bernoulli samples of logits (T, B) by the binary Gumbel trick, with the gradient of the soft ones."""
-        uniform = torch.rand_like(logits).clamp(1e-6, 1 - 1e-6)
+        uniform = uniforms(*logits.shape, device=logits.device).clamp(1e-6, 1 - 1e-6)
         soft = torch.sigmoid((logits + torch.logit(uniform)) / temperature)
         return (soft > 0.5).float() + (soft - soft.detach())
 
@@ -590,7 +604,7 @@ class HWM(nn.Module):
         m = self.draw_m(q_m, temperature) if trains else (q_m > 0).float()
         taken = F.one_hot(actions, self.num_actions).float()  # (T, B, A)
         sizes = (self.args.stoch_z, self.args.stoch_w)
-        noise = [torch.randn(steps, batch, size, device=frames.device) * trains for size in sizes]
+        noise = [torch.randn(steps, batch, size).to(frames.device) * trains for size in sizes]
         state = self.start(batch, frames)
         length, segments = frames.new_zeros(batch, 1), frames.new_zeros(batch, 1)
         previous_m, previous_action = frames.new_zeros(batch, 1), torch.zeros_like(taken[0])
@@ -618,7 +632,7 @@ class HWM(nn.Module):
             previous_action, previous_m = taken[t], m[t, :, None]
             if mode in ("prior", "sampled"):
                 p = torch.sigmoid(self.prior_m(torch.cat([*state, taken[t]], -1)))
-                previous_m = (p > (torch.rand_like(p) if mode == "sampled" else 0.5)).float()
+                previous_m = (p > (uniforms(*p.shape, device=p.device) if mode == "sampled" else 0.5)).float()
         columns = [torch.stack(column) for column in zip(*made)]  # (T, B, ...)
         belief = Belief(*columns[:4])
         p_m = self.prior_m(torch.cat([*belief, taken], -1)).squeeze(-1)
@@ -651,7 +665,7 @@ def hwm_loss(
     decides = torch.cat([chosen[1:], torch.zeros_like(chosen[:1])])  # m_t of the last step, and before a forced read
     kl_m = decides * balanced(kl_bernoulli, made.q_m, made.p_m, args.kl_balance)
     reads = made.reads * chosen
-    read_rate = reads.sum() / chosen.sum()
+    read_rate = reads.sum() / chosen.sum().clamp(min=1)
     loss = (reconstruction + args.kl_z_scale * kl_z + args.kl_w_scale * kl_w + args.kl_m_scale * kl_m).mean()
     excess = read_rate - budget
     loss = loss + args.read_price * read_rate + args.budget_price * (excess.abs() if surprise_price else F.relu(excess))
@@ -661,7 +675,7 @@ def hwm_loss(
     loss = loss + surprise_price * (reads * (surprise - usual).detach()).mean()  # 0, its gradient moves q(m) alone
     terms = {"reconstruction": reconstruction, "kl_z": kl_z, "kl_w": kl_w, "kl_m": kl_m, "read_rate": read_rate}
     agreement = ((made.p_m > 0) == (made.q_m > 0)).float()
-    terms["agreement"] = (agreement * decides).sum() / decides.sum()
+    terms["agreement"] = (agreement * decides).sum() / decides.sum().clamp(min=1)
     return loss, {name: value.detach().mean() for name, value in terms.items()}
 
 
@@ -858,9 +872,11 @@ def objective(model: HWM, data: Sequence) -> float:
     return -sum(terms[name].item() for name in ("reconstruction", "kl_z", "kl_w", "kl_m"))
 
 
-def new_model(args: Args, data: Sequence, num_actions: int) -> tuple[HWM, torch.optim.Adam]:
-    """A model with weights of its own, on the data's device, and its optimiser."""
-    model = HWM(args, data.frames.shape[1], num_actions).to(data.frames.device)
+def new_model(
+    args: Args, frame_mean: np.ndarray, num_actions: int, device: torch.device
+) -> tuple[HWM, torch.optim.Adam]:
+    """A model with weights of its own, and its optimiser."""
+    model = HWM(args, frame_mean, num_actions).to(device)
     return model, torch.optim.Adam(model.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
 
 
@@ -887,7 +903,7 @@ def compile_step(model: HWM, data: Sequence, args: Args) -> bool:
 # ---------------------------------------------------------------------------------------------------------------------
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
-CHECKPOINT_FORMAT = "hwm_segment 2"
+CHECKPOINT_FORMAT = "hwm_segment 3"
 FINISH = ("save_model", "heldout_episodes", "heldout_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", "demos", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -1061,8 +1077,9 @@ class Segmented(NamedTuple):
 
 
 @torch.no_grad()
-def segment(model: HWM, episodes: list[Episode], normalizer: Normalizer, mode: str, device: torch.device) -> Segmented:
+def segment(model: HWM, episodes: list[Episode], mode: str, device: torch.device) -> Segmented:
     """Run the model over whole episodes in the given mode of `HWM.infer`."""
+    normalizer = model.normalizer()
     data = Sequence(*(column.to(device) for column in side_by_side(episodes, normalizer)))
     made = model.infer(data, mode)
     reconstructed = normalizer.frames(model.decode(made.belief).cpu().numpy())
@@ -1081,20 +1098,18 @@ def segment(model: HWM, episodes: list[Episode], normalizer: Normalizer, mode: s
     )
 
 
-def held_out_scores(model: HWM, episodes: list[Episode], normalizer: Normalizer, device) -> dict[str, float]:
-    """How good the boundaries of p(m) are, for the record: no attempt is chosen by it."""
-    scores = boundary_scores(segment(model, episodes, normalizer, "prior", device).found, [e.rooms for e in episodes])
-    return {name: scores[name] for name in ("f1_4_rooms_0", "f1_4_rooms_1", "read_rate", "door_entry_recall")}
+ATTEMPT_MEASURES = ("f1_4_rooms_0", "f1_4_rooms_1", "read_rate", "door_entry_recall")
 
 
-def agreed_scores(model: HWM, models: list[dict], episodes: list[Episode], normalizer: Normalizer, device) -> dict:
-    """The measures of the boundaries on which most models of these parameters agree, m from p."""
-    found = []
+def attempts_scores(model: HWM, models: list[dict], episodes: list[Episode], device) -> tuple[list[dict], dict]:
+    """How good the boundaries of p(m) are in each model of these parameters, and all measures of those on which most agree."""
+    found, rooms = [], [episode.rooms for episode in episodes]
     for parameters in models:
         model.load_state_dict(parameters)
-        found.append(segment(model, episodes, normalizer, "prior", device).found)
-    agreed = [agree(np.stack(votes)) for votes in zip(*found)]
-    return boundary_scores(agreed, [episode.rooms for episode in episodes])
+        found.append(segment(model, episodes, "prior", device).found)
+    scores = [boundary_scores(each, rooms) for each in found]
+    agreed = boundary_scores([agree(np.stack(votes)) for votes in zip(*found)], rooms)
+    return [{name: each[name] for name in ATTEMPT_MEASURES} for each in scores], agreed
 
 
 def probes(train: Segmented, test: Segmented, train_episodes: list[Episode], test_episodes: list[Episode]) -> dict:
@@ -1113,7 +1128,7 @@ def probes(train: Segmented, test: Segmented, train_episodes: list[Episode], tes
     return accuracy
 
 
-def evaluate(model: HWM, episodes: Split, normalizer: Normalizer, args: Args, device) -> dict:
+def evaluate(model: HWM, episodes: Split, args: Args, device: torch.device) -> dict:
     """All measures on the held-out episodes: m from p (section 3.5.1), drawn from p, and from q; and their floors."""
     heldout = episodes.heldout
     rooms, states = [episode.rooms for episode in heldout], [episode.states for episode in heldout]
@@ -1122,7 +1137,7 @@ def evaluate(model: HWM, episodes: Split, normalizer: Normalizer, args: Args, de
     labels = {"8_labels": rooms, "4_rooms": [merge_doors(each) for each in rooms]}
     results = {}
     for mode in ("prior", "sampled", "posterior"):
-        made = segment(model, heldout, normalizer, mode, device)
+        made = segment(model, heldout, mode, device)
         result = {**boundary_scores(made.found, rooms), "reconstruction_mse": made.error}
         for name, each in labels.items():
             true = np.concatenate([part[1:] != part[:-1] for part in each])
@@ -1131,11 +1146,9 @@ def evaluate(model: HWM, episodes: Split, normalizer: Normalizer, args: Args, de
         result["mutual_information_z_room"] = normalised_mutual_information(
             k_means(standard, 8, rng), np.concatenate(rooms)
         )
-        result["probes"] = probes(
-            segment(model, episodes.probed, normalizer, mode, device), made, episodes.probed, heldout
-        )
+        result["probes"] = probes(segment(model, episodes.probed, mode, device), made, episodes.probed, heldout)
         results[mode] = result
-    constant = np.concatenate([episode.frames for episode in heldout]) / 255 - normalizer.mean
+    constant = np.concatenate([episode.frames for episode in heldout]) / 255 - model.normalizer().mean
     about = {
         "episodes": len(heldout),
         "pairs": int(sum(map(len, rooms))),
@@ -1148,10 +1161,11 @@ SEGMENT_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple
 
 
 @torch.no_grad()
-def draw_figure(model: HWM, episode: Episode, normalizer: Normalizer, device: torch.device, path: Path) -> None:
+def draw_figure(model: HWM, episode: Episode, device: torch.device, path: Path) -> None:
     """Fig. 3.4: an episode, and what the decoder makes of z and w turned on one after the other; colours are segments."""
     from matplotlib.figure import Figure
 
+    normalizer = model.normalizer()
     data = Sequence(*(column.to(device) for column in side_by_side([episode], normalizer)))
     made = model.infer(data, "prior")
     rows = [("(a) truth", episode.frames / 255)]
@@ -1215,19 +1229,19 @@ def start_wandb(args: Args, run_dir: Path) -> None:
     )
 
 
-def fingerprint(data: Sequence) -> str:
+def fingerprint(episodes: list[Episode]) -> str:
     """What the training data are, for a run that goes on with the same."""
-    return hashlib.sha256(data.frames.numpy().tobytes() + data.actions.numpy().tobytes()).hexdigest()
+    digest = hashlib.sha256()
+    for episode in episodes:
+        digest.update(episode.frames.tobytes() + episode.actions.tobytes())
+    return digest.hexdigest()
 
 
 def main(args: Args) -> int:
     """Train, measure and write everything into the run's folder. Returns the exit code."""
     args = complete_args(args)
     episodes, args.env_id = read_split(args)
-    mean = np.concatenate([episode.frames for episode in episodes.training]).mean(0) / 255
-    normalizer = Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32))
-    data = in_a_row(episodes.training, normalizer)
-    data_id, num_actions = fingerprint(data), int(data.actions.max()) + 1
+    data_id = fingerprint(episodes.training)
     run_dir, checkpoint = open_run_dir(args)
     last_update = min(args.attempts * args.total_updates, args.stop_at)
     same_data = checkpoint is None or checkpoint["data"] == data_id
@@ -1249,12 +1263,14 @@ def main(args: Args) -> int:
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     stop = StopSignal()
 
-    data = Sequence(*(column.to(device) for column in data))
-    model, optimizer = new_model(args, data, num_actions)
-    update, training_seconds, offset, attempts, models = 0, 0.0, 0, [], []
+    frame_mean = np.concatenate([episode.frames for episode in episodes.training]).mean(0) / 255
+    num_actions = max(int(episode.actions.max()) for episode in episodes.training) + 1
+    model, optimizer = new_model(args, frame_mean, num_actions, device)
+    data = Sequence(*(column.to(device) for column in in_a_row(episodes.training, model.normalizer())))
+    update, training_seconds, offset, objectives, models = 0, 0.0, 0, [], []
     if checkpoint is not None:
         update, training_seconds, offset = checkpoint["update"], checkpoint["training_seconds"], checkpoint["offset"]
-        attempts, models = checkpoint["attempts"], checkpoint["models"]
+        objectives, models = checkpoint["objectives"], checkpoint["models"]
         model.load_state_dict(checkpoint["model"])
         optimizer.load_state_dict(checkpoint["optimizer"])
     is_compiled = args.compile and update < last_update and compile_step(model, data, args)
@@ -1273,16 +1289,14 @@ def main(args: Args) -> int:
 
     while update < last_update:
         if update and update % args.total_updates == 0:  # the next attempt
-            model, optimizer = new_model(args, data, num_actions)
+            model, optimizer = new_model(args, frame_mean, num_actions, device)
             if is_compiled:
                 compile_step(model, data, args)
         terms = train_step(model, optimizer, data, update)
         update += 1
         progress.update(1)
         if update % args.total_updates == 0:
-            with torch.random.fork_rng():  # so that what is held out changes nothing
-                scores = held_out_scores(model, episodes.heldout, normalizer, device)
-            attempts.append({"objective": objective(model, data), **scores})
+            objectives.append(objective(model, data))
             models.append({name: value.clone() for name, value in model.state_dict().items()})
         crossed = update % args.checkpoint_interval == 0
         ends = update % args.total_updates == 0 or update == last_update
@@ -1304,7 +1318,7 @@ def main(args: Args) -> int:
                 "update": update,
                 "training_seconds": training_seconds,
                 "offset": updates_csv.sync(),
-                "attempts": attempts,
+                "objectives": objectives,
                 "models": models,
                 "model": model.state_dict(),
                 "optimizer": optimizer.state_dict(),
@@ -1320,12 +1334,13 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    measured = {"attempts": attempts}
-    if len(models) > 1:
-        measured["agreed"] = agreed_scores(model, models, episodes.heldout, normalizer, device)
+    measured = {"attempts": []}
     if models:
-        model.load_state_dict(models[int(np.argmax([each["objective"] for each in attempts]))])
-    finish_run(model, measured, episodes, normalizer, args, run_dir, update, training_seconds, device)
+        scores, agreed = attempts_scores(model, models, episodes.heldout, device)
+        measured["attempts"] = [{"objective": value, **each} for value, each in zip(objectives, scores)]
+        measured |= {"agreed": agreed} if len(models) > 1 else {}
+        model.load_state_dict(models[int(np.argmax(objectives))])
+    finish_run(model, measured, episodes, args, run_dir, update, training_seconds, device)
     writer.close()
     return 0
 
@@ -1334,7 +1349,6 @@ def finish_run(
     model: HWM,
     measured: dict,
     episodes: Split,
-    normalizer: Normalizer,
     args: Args,
     run_dir: Path,
     update: int,
@@ -1342,9 +1356,9 @@ def finish_run(
     device,
 ) -> None:
     """Measure, draw Fig. 3.4, save what was asked for, and write `result.json` last; `measured` is of all attempts."""
-    segmentation = {**evaluate(model, episodes, normalizer, args, device), **measured}
+    segmentation = {**evaluate(model, episodes, args, device), **measured}
     write_json(run_dir / "segmentation.json", segmentation)
-    draw_figure(model, longest_way(episodes.heldout), normalizer, device, run_dir / "figure_3_4.png")
+    draw_figure(model, longest_way(episodes.heldout), device, run_dir / "figure_3_4.png")
     if args.save_model:
         content = safetensors.torch.save(model.state_dict(), {"args": json.dumps(arguments(args))})
         write_whole(run_dir / "model.safetensors", content)

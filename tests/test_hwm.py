@@ -86,7 +86,7 @@ def make_args(**changes) -> method.Args:
 
 def make_model(frame_size: int = 7, **changes) -> method.HWM:
     torch.manual_seed(0)
-    return method.HWM(make_args(**changes), frame_size, 3)
+    return method.HWM(make_args(**changes), np.zeros(frame_size), 3)
 
 
 def make_data(lengths: list[list[int]], frame_size: int = 7) -> method.Sequence:
@@ -332,7 +332,7 @@ def test_training_steps_lower_the_loss_at_the_scheduled_rate():
     torch.manual_seed(0)
     data = make_data([[9] * 10])
     data = method.Sequence(data.frames[:, 0].sign(), data.actions[:, 0], data.first[:, 0])
-    model, optimizer = method.new_model(args, data, 3)
+    model, optimizer = method.new_model(args, np.zeros(7), 3, torch.device("cpu"))
     losses = [method.train_step(model, optimizer, data, update)["loss"].item() for update in range(200)]
     assert optimizer.param_groups[0]["lr"] == method.schedule(args, 199)[0] == args.learning_rate
     assert np.mean(losses[-20:]) < 0.8 * np.mean(losses[20:40])
@@ -448,7 +448,8 @@ def test_narrow_w():
 @pytest.mark.parametrize("mode", ["posterior", "prior"])
 def test_what_is_measured_of_an_episode(mode):
     """m_t beside the step after it, z and w of each step, none of the zeros behind a shorter episode."""
-    model, names = make_model(frame_size=12), np.arange(10.0).reshape(5, 2)
+    model, names = make_model(frame_size=12, red_scale=1.0), np.arange(10.0).reshape(5, 2)
+    model.frame_mean = torch.full((2, 2, 3), 0.3)
     rows = torch.from_numpy(names)[..., None].float()  # (T, B, 1), a number for each step of each episode
     belief = method.Belief(rows, rows + 100, rows + 200, rows + 300)
     reads = (torch.arange(10).view(5, 2) % 3 == 0).float()
@@ -460,8 +461,7 @@ def test_what_is_measured_of_an_episode(mode):
         method.Episode(np.full((n, 2, 2, 3), 51.0, np.float32), np.zeros(n, int), np.zeros((n, 3)), np.zeros(n))
         for n in (5, 3)
     ]
-    normalizer = method.Normalizer(np.full((2, 2, 3), 0.3), np.ones(3))
-    found = method.segment(model, episodes, normalizer, mode, torch.device("cpu"))
+    found = method.segment(model, episodes, mode, torch.device("cpu"))
     steps = [names[:5, 0], names[:3, 1]]
     assert [part.tolist() for part in found.found] == [[bool(n % 3 == 0) for n in part[1:]] for part in steps]
     logits = 400 if mode == "posterior" else 500
@@ -469,6 +469,25 @@ def test_what_is_measured_of_an_episode(mode):
     assert found.z.tolist() == [[n, n + 100] for part in steps for n in part]
     assert found.w.tolist() == [[n + 200, n + 300] for part in steps for n in part]
     assert found.error == pytest.approx(0.01, rel=1e-4)  # 0.3 where 51 / 255 = 0.2 was seen
+
+
+@pytest.mark.parametrize("mode", ["posterior", "prior"])
+def test_what_an_episode_is_measured_beside_changes_nothing(mode):
+    rng, model = np.random.default_rng(0), make_model(frame_size=12, boundary_bound=0.0, read_bias=0.0)
+    model.frame_mean = torch.full((2, 2, 3), 0.5)
+    episodes = [
+        method.Episode(rng.uniform(0, 255, (n, 2, 2, 3)).astype(np.float32), rng.integers(3, size=n), None, None)
+        for n in (4, 11)
+    ]
+    alone, together = (method.segment(model, some, mode, torch.device("cpu")) for some in (episodes[:1], episodes))
+    assert np.allclose(alone.scores, together.scores[:3], atol=1e-5) and np.ptp(alone.scores) > 1e-3
+    assert np.allclose(alone.w, together.w[:4], atol=1e-5) and alone.found[0].tolist() == together.found[0].tolist()
+
+
+@pytest.mark.parametrize("changes", [{"max_segments": 1}, {"max_segment_length": 1}])
+def test_a_loss_without_a_step_that_is_free_to_read_is_finite(changes):
+    loss, terms = method.hwm_loss(make_model(**changes), make_data([[9]]), 1.0, 1.0)
+    assert torch.isfinite(loss) and terms["read_rate"] == 0
 
 
 @pytest.mark.parametrize(("before", "after"), [(0, 0), (1, 1), (2, 2), (1, 0), (0, 2)])
@@ -613,10 +632,11 @@ def test_the_attempt_with_the_greatest_objective_is_kept(demos, small_run):
     args = method.parse_args([*map(str, SMALL), "--demos", str(demos)])
     args = method.complete_args(args)
     training = method.read_split(args)[0].training
+    model = method.HWM(args, np.zeros((22, 22, 3)), 3)
+    model.load_state_dict(load_file(small_run / "model.safetensors"))
     mean = np.concatenate([episode.frames for episode in training]).mean(0) / 255
     data = method.in_a_row(training, method.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32)))
-    model = method.HWM(args, data.frames.shape[1], int(data.actions.max()) + 1)
-    model.load_state_dict(load_file(small_run / "model.safetensors"))
+    assert torch.equal(data.frames, method.in_a_row(training, model.normalizer()).frames)
     assert method.objective(model, data) == pytest.approx(max(values), rel=1e-5)
 
 
@@ -624,18 +644,19 @@ def test_boundaries_on_which_most_attempts_agree(demos, small_run):
     """The models of the checkpoint, and such as read always and never."""
     args = method.complete_args(method.parse_args([*map(str, SMALL), "--demos", str(demos)]))
     split = method.read_split(args)[0]
-    mean = np.concatenate([episode.frames for episode in split.training]).mean(0) / 255
-    normalizer = method.Normalizer(mean, np.array([args.red_scale, 1, 1], np.float32))
-    model = method.HWM(args, mean.size, 3)
+    model = method.HWM(args, np.zeros((22, 22, 3)), 3)
     trained = torch.load(small_run / "checkpoint.pt", weights_only=True)["models"]
     *_, bias = (name for name in trained[0] if name.startswith("prior_m."))
     always, never = ({**trained[0], bias: torch.full((1,), logit)} for logit in (1e4, -1e4))
-    scores = {}
+    scores, each = {}, {}
     for name, models in (("two", [always, never, always]), ("none", [never, never]), ("run", trained)):
-        scores[name] = method.agreed_scores(model, models, split.heldout, normalizer, torch.device("cpu"))
+        each[name], scores[name] = method.attempts_scores(model, models, split.heldout, torch.device("cpu"))
     assert scores["none"]["read_rate"] == 0 < scores["two"]["read_rate"]
+    assert [one["read_rate"] for one in each["two"]] == [1, 0, 1]
     segmentation = json.loads((small_run / "segmentation.json").read_text())
     assert len(trained) == 2 and segmentation["agreed"] == scores["run"]
+    for one, kept in zip(each["run"], segmentation["attempts"]):
+        assert one == {name: value for name, value in kept.items() if name != "objective"}
 
 
 def test_objective_is_eq_3_3_5_with_every_weight_1():
