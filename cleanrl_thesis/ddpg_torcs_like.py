@@ -1666,15 +1666,13 @@ def check_video(env_id: str) -> None:
         raise UsageError(f"--capture-video: cannot draw {env_id} here: {first_line(error)}") from None
 
 
-def record_video(policy, args: Args, run_dir: Path, seed: int) -> None:
-    """Play one episode and write it into `videos/`."""
+def record_video(episode: dict[str, np.ndarray], args: Args, run_dir: Path) -> None:
+    """Play an episode of `play` again by its seed and actions and write it into `videos/`."""
     env = make_env(args.env_id, "rgb_array", **env_options(args))
     env = gym.wrappers.RecordVideo(env, str(run_dir / "videos"), lambda episode: True)
-    obs, _ = env.reset(seed=seed)
-    for _ in range(MAX_EVALUATION_STEPS):
-        obs, _, terminated, truncated, _ = env.step(policy(obs[None])[0])
-        if terminated or truncated:
-            break
+    env.reset(seed=int(episode["seed"]))
+    for action in episode["actions"]:
+        env.step(action)
     env.close()
 
 
@@ -1692,10 +1690,10 @@ def scaled(actions: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
 def evaluate(policy, args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes that training never saw; write `evaluation.json` and, if asked, a video."""
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
-    episodes = play(held(policy, args.frame_skip), make_games(args, len(seeds)), seeds)
+    episodes = play(held(policy, args.frame_skip), make_games(args, len(seeds)), seeds, keep=args.capture_video)
     returns = [float(episode["rewards"].sum()) for episode in episodes]
     if args.capture_video:
-        record_video(held(policy, args.frame_skip), args, run_dir, seeds[0])
+        record_video(episodes[0], args, run_dir)
     evaluation = {
         "env_id": args.env_id,
         "mode": "without noise",

@@ -1068,7 +1068,7 @@ class Learner:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
     def update(self, data: Chunks) -> dict[str, torch.Tensor]:
-        """One gradient step on everything (Eq. 3.3.11); returns what to log."""
+        """One gradient step on everything (Eq. 3.3.11; with two levels Eq. 3.3.18); returns what to log."""
         states, parts = self.learn_model(data)
         return {**parts, **self.learn_behaviour(self.draw_starts(states, data.terminals))}
 

@@ -184,8 +184,9 @@ class Args:
     reward_form: Literal["positive", "signed"] = "positive"
     """positive: −log D (Eq. 2.3.1), with which it pays to survive; signed: log(1 − D) − log D, with which it need not"""
     bc_epochs: int = 20
-    """passes over the human's demonstrations in which the policy first learns actions (behaviour cloning); 0: none; with
-    `--total-timesteps 0` that is all: both experts' actions are mixed into one mean, as section 2.3.2 warns against"""
+    """passes over the human's demonstrations (at α = 1 the RL expert's) in which the policy first learns actions (behaviour
+    cloning); 0: none; with `--total-timesteps 0` that is all: between α = 0 and 1 both experts' actions are mixed into one mean, as
+    section 2.3.2 warns against"""
     hidden_size: int = 100
     """units in each of the two hidden layers of all networks"""
 
@@ -1635,6 +1636,14 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
     return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
 
 
+def learned_from(run_dir: Path, checkpoint: dict | None) -> str | None:
+    """Fingerprint of the demonstrations that a run learns from, of a finished clone too; None where it has not begun."""
+    if checkpoint is not None:
+        return checkpoint["data"]
+    result = run_dir / "result.json"
+    return json.loads(result.read_text()).get("data") if result.exists() else None
+
+
 class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
@@ -1775,6 +1784,12 @@ def check_video(env_id: str) -> None:
         raise UsageError(f"--capture-video: cannot draw {env_id} here: {first_line(error)}") from None
 
 
+def action_space(args: Args) -> gym.spaces.Box:
+    """The task's actions, with bounds in the networks' float32."""
+    space = make_env(args.env_id, **env_options(args)).action_space
+    return gym.spaces.Box(space.low.astype(np.float32), space.high.astype(np.float32))
+
+
 def make_policy(agent: Agent, mode: str, space: gym.spaces.Box, seed: int):
     """The policy as a function from observations (N, O) to the environment's actions (N, A): sampled, or its mean."""
     mean, deviation = numpy_mean(agent), agent.actor_logstd.detach().exp().cpu().numpy()
@@ -1789,30 +1804,27 @@ def make_policy(agent: Agent, mode: str, space: gym.spaces.Box, seed: int):
     return policy
 
 
-def record_video(policy, args: Args, run_dir: Path, seed: int) -> None:
-    """Play one episode and write it into `videos/`."""
+def record_video(episode: dict[str, np.ndarray], args: Args, run_dir: Path) -> None:
+    """Play an episode of `play` again by its seed and actions and write it into `videos/`."""
     env = make_env(args.env_id, "rgb_array", **env_options(args))
     env = gym.wrappers.RecordVideo(env, str(run_dir / "videos"), lambda episode: True)
-    obs, _ = env.reset(seed=seed)
-    for _ in range(MAX_EVALUATION_STEPS):
-        obs, _, terminated, truncated, _ = env.step(policy(obs[None])[0])
-        if terminated or truncated:
-            break
+    env.reset(seed=int(episode["seed"]))
+    for action in episode["actions"]:
+        env.step(action)
     env.close()
 
 
 def evaluate(agent: Agent, args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes that training never saw, in each mode; write `evaluation.json` and, if asked, a video."""
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
-    space = make_env(args.env_id, **env_options(args)).action_space
-    evaluation = {"env_id": args.env_id, "seeds": seeds}
+    space, evaluation = action_space(args), {"env_id": args.env_id, "seeds": seeds}
     for mode in MODES:
         policy = held(make_policy(agent, mode, space, args.seed), args.frame_skip)
-        episodes = play(policy, make_games(args, len(seeds)), seeds)
+        films = args.capture_video and mode == args.eval_mode
+        episodes = play(policy, make_games(args, len(seeds)), seeds, keep=films)
         evaluation[mode] = {"mode": mode, **measured(episodes, args)}
-    if args.capture_video:
-        policy = held(make_policy(agent, args.eval_mode, space, args.seed), args.frame_skip)
-        record_video(policy, args, run_dir, seeds[0])
+        if films:
+            record_video(episodes[0], args, run_dir)
     write_json(run_dir / "evaluation.json", evaluation)
     return evaluation
 
@@ -1836,7 +1848,7 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
     """Write `--save-demos` episodes of the student into `demos/`."""
     seeds = [episode_seed(args.seed, STUDENT_STREAM, i) for i in range(args.save_demos)]
-    policy = make_policy(agent, args.eval_mode, make_env(args.env_id, **env_options(args)).action_space, args.seed)
+    policy = make_policy(agent, args.eval_mode, action_space(args), args.seed)
     episodes = play(held(policy, args.frame_skip), make_games(args, len(seeds)), seeds, keep=True)
     about = {"player": f"{args.exp_name}, alpha {args.alpha}", "mode": args.eval_mode}
     write_demonstrations(run_dir / "demos", episodes, {"env_id": args.env_id, "options": env_options(args), **about})
@@ -1957,8 +1969,7 @@ def behaviour_cloning(agent: Agent, experts: Experts, args: Args) -> None:
 def main(args: Args) -> int:
     """Train, evaluate and write everything into the run's folder. Returns the exit code."""
     args = complete_args(args)
-    env = make_env(args.env_id, **env_options(args))
-    space = env.action_space
+    env, space = make_env(args.env_id, **env_options(args)), action_space(args)
     if args.capture_video:
         check_video(args.env_id)
     torch.set_num_threads(args.num_threads)
@@ -1967,7 +1978,8 @@ def main(args: Args) -> int:
     about_experts = {name: measured(part, args) for name, part in (("rl", rl), ("human", human)) if part}
     run_dir, checkpoint = open_run_dir(args)
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / args.batch_size))
-    same_data = checkpoint is None or checkpoint["data"] == experts.fingerprint()
+    data_id = experts.fingerprint()
+    same_data = learned_from(run_dir, checkpoint) in (None, data_id)
     require(same_data, "--resume", run_dir, "demonstrations are no longer those that the run began with")
     if is_done(run_dir, args, last_iteration * args.batch_size):
         print(f"{run_dir} is done")
@@ -2065,7 +2077,7 @@ def main(args: Args) -> int:
             state = {
                 "args": arguments(args),
                 "arithmetic": device.type,
-                "data": experts.fingerprint(),
+                "data": data_id,
                 "iteration": iteration,
                 "training_seconds": training_seconds,
                 "offsets": {"episodes": episodes_csv.sync(), "updates": updates_csv.sync()},
@@ -2086,13 +2098,20 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    finish_run(agent, about_experts, args, run_dir, global_step, training_seconds, writer)
+    finish_run(agent, about_experts, data_id, args, run_dir, global_step, training_seconds, writer)
     writer.close()
     return 0
 
 
 def finish_run(
-    agent: Agent, experts_summary: dict, args: Args, run_dir: Path, global_step: int, seconds: float, writer
+    agent: Agent,
+    experts_summary: dict,
+    data_id: str,
+    args: Args,
+    run_dir: Path,
+    global_step: int,
+    seconds: float,
+    writer: SummaryWriter,
 ) -> None:
     """Evaluate, draw, save what was asked for, and write `result.json` last."""
     evaluation = evaluate(agent, args, run_dir)
@@ -2113,6 +2132,7 @@ def finish_run(
         "complete": global_step == args.num_iterations * args.batch_size,
         "finish": {name: arguments(args)[name] for name in FINISH},
         "experts": experts_summary,
+        "data": data_id,
         "training": {"mode": "sampled", **summary(read_episodes(run_dir)[-50:, 1])},
         "evaluation": {
             mode: {name: value for name, value in evaluation[mode].items() if name != "returns"} for mode in MODES

@@ -220,15 +220,15 @@ class Args:
     num_skills: int = 8
     """skills that the high-level policy chooses from"""
     actor_learning_rate: float | None = None
-    """Adam's learning rate for the actor"""
+    """Adam's learning rate for both actors"""
     critic_learning_rate: float | None = None
-    """Adam's learning rate for the critic"""
+    """Adam's learning rate for both critics"""
     adam_eps: float | None = None
-    """Adam's ε for actor and critic; 1e-5 for the world model"""
+    """Adam's ε for actors and critics; 1e-5 for the world model"""
     ent_coef: float | None = None
-    """weight of the actor's entropy η"""
+    """weight η of the entropy of both policies"""
     slow_interval: int = 100
-    """updates between copies of the critic to the slow critic"""
+    """updates between copies of the critics to the slow critics"""
     weight_decay: float = 1e-6
     """share of each weight that an update takes away"""
     max_grad_norm: float = 100.0
@@ -1231,8 +1231,8 @@ def imagine(model: nn.Module, behaviour: Behaviour, state: NamedTuple, horizon: 
         decides.append(read.squeeze(1))
     stacked = as_computed(torch.stack(features))  # (H + 1, N, F)
     rewards, goes_on = model.outcome(stacked[1:])
-    columns = (torch.stack(column) for column in (skills, decides))
-    return Dream(stacked, torch.stack(actions), rewards, gamma * goes_on, *columns)
+    chosen = as_computed(torch.stack(skills))  # (H + 1, N, K)
+    return Dream(stacked, torch.stack(actions), rewards, gamma * goes_on, chosen, torch.stack(decides))
 
 
 def lambda_return(
@@ -1266,11 +1266,11 @@ def high_return(rewards, discounts, decides, high_values, last_value, gae_lambda
 
 
 def policy_loss(logits, chosen, advantages, weights, ent_coef: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Eq. 3.3.9: a policy's loss, its terms weighed, and its mean entropy; logits and chosen (..., A), the others (...)."""
+    """Eq. 3.3.9: a policy's loss, its terms weighed and summed, and its entropies (...); logits and chosen (..., A), others (...)."""
     log_policy = logits.log_softmax(-1)
     entropy = -(log_policy.exp() * log_policy).sum(-1)
     terms = (log_policy * chosen).sum(-1) * advantages + ent_coef * entropy
-    return -(weights * terms).sum(), (weights * entropy).sum() / weights.sum().clamp(min=1e-8)
+    return -(weights * terms).sum(), entropy
 
 
 def behaviour_loss(
@@ -1300,8 +1300,8 @@ def behaviour_loss(
     losses |= {"high_actor": high_actor / number, "high_critic": high_critic}  # Eq. 3.3.17
     parts = {
         **losses,
-        "entropy": entropy,
-        "high_entropy": high_entropy,
+        "entropy": entropy.mean(),
+        "high_entropy": high_entropy.sum() / number,
         "advantage_std": (returns - values[:-1]).std(correction=0),
     }
     parts |= {
@@ -1309,7 +1309,7 @@ def behaviour_loss(
         "dream_reward": dream.rewards.max(),
         "dream_reads": dream.decides[1:].mean(),
     }
-    usage = skills.mean((0, 1))
+    usage = behaviour.high_policy(dream.features[0]).softmax(-1).mean(0)
     parts |= {"skill_usage_entropy": -(usage * usage.clamp(min=1e-8).log()).sum()}
     parts |= {"skill_information": skill_information(behaviour, dream.features[0])}
     return losses, {f"losses/{name}": value.detach() for name, value in parts.items()}
@@ -1365,7 +1365,7 @@ class Learner:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
     def update(self, data: Chunks) -> dict[str, torch.Tensor]:
-        """One gradient step on everything (Eq. 3.3.11); returns what to log."""
+        """One gradient step on everything (Eq. 3.3.11; with two levels Eq. 3.3.18); returns what to log."""
         states, parts = self.learn_model(data)
         return {**parts, **self.learn_behaviour(self.draw_starts(states, data.terminals))}
 

@@ -11,6 +11,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import safetensors.torch
@@ -48,6 +49,14 @@ def student(tmp_path_factory, expert) -> Path:
     flags = ["--demos-rl", expert / "demos", "--run-dir", "run", "--save-model", "--save-demos", 2]
     run(*SMALL_GAIL, *flags, cwd=folder, script=GAIL)
     return folder / "run"
+
+
+class DoubleActions(gym.Wrapper):
+    """An environment whose actions are of float64."""
+
+    def __init__(self, env: gym.Env):
+        super().__init__(env)
+        self.action_space = gym.spaces.Box(env.action_space.low, env.action_space.high, dtype=np.float64)
 
 
 def flat(state: object) -> list[torch.Tensor]:
@@ -293,13 +302,41 @@ def test_a_resume_with_other_hyperparameters_names_them(student, expert, tmp_pat
     assert_refused(gail, capsys, flags, ["--gamma 0.9", "was"])
 
 
-def test_a_resume_with_other_demonstrations_is_refused(expert, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("steps", [512, 0])
+def test_a_resume_with_other_demonstrations_is_refused(steps, expert, tmp_path, monkeypatch, capsys):
+    """Of a student, and of a clone, which has no checkpoint."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(expert / "demos", "demos")
-    flags = [*SMALL_GAIL, "--total-timesteps", 512, "--alpha", 1, "--demos-rl", "demos", "--run-dir", "run"]
+    flags = [*SMALL_GAIL, "--total-timesteps", steps, "--alpha", 1, "--demos-rl", "demos", "--run-dir", "run"]
     run(*flags, cwd=tmp_path, script=GAIL)
+    assert "is done" in run(*flags, "--resume", cwd=tmp_path, script=GAIL).stdout
     rewrite(Path("demos"), lambda arrays: {**arrays, "actions": -arrays["actions"]})
-    assert_refused(gail, capsys, [*flags, "--resume", "--eval-episodes", 3], ["--resume", "demonstrations"])
+    more = ["--eval-episodes", 3] if steps else []
+    assert_refused(gail, capsys, [*flags, "--resume", *more], ["--resume", "demonstrations"])
+
+
+@pytest.mark.parametrize("mode", gail.MODES)
+def test_the_video_is_the_first_evaluation_episode(mode, student, tmp_path, monkeypatch):
+    args = gail.complete_args(gail.Args(capture_video=True, eval_episodes=3, eval_mode=mode, frame_skip=2, alpha=0))
+    agent, filmed = gail.Agent(65, 2, 16), []
+    agent.load_state_dict(safetensors.torch.load_file(student / "model.safetensors"))
+    monkeypatch.setattr(gail, "record_video", lambda episode, args, run_dir: filmed.append(episode))
+    evaluation = gail.evaluate(agent, args, tmp_path)
+    env = gail.make_env(args.env_id, **gail.env_options(args))
+    env.reset(seed=int(filmed[0]["seed"]))
+    played = sum(env.step(action)[1] for action in filmed[0]["actions"])
+    assert len(filmed) == 1 and played == pytest.approx(evaluation[mode]["returns"][0], rel=1e-6)
+
+
+def test_actions_of_float64_are_bounded_in_float32():
+    gym.register("Doubles-v0", lambda **_: DoubleActions(gym.make("Pendulum-v1")))
+    try:
+        space = gail.action_space(gail.Args(env_id="Doubles-v0"))
+    finally:
+        gym.registry.pop("Doubles-v0")
+    actions = np.array([[3.0], [-0.5]], np.float32)
+    assert space.low.dtype == space.high.dtype == gail.bounded(actions, space.low, space.high).dtype == np.float32
+    assert gail.bounded(actions, space.low, space.high).tolist() == [[2.0], [-0.5]]
 
 
 @pytest.mark.slow
