@@ -16,14 +16,14 @@ again after every crash: on the same machine the run ends with the same bytes.
 
 | setting | value | source |
 |---|---|---|
-| frames, for testing | 16,000, of them 1,500 drawn at random; Gopher 55,000 and 5,000 | sections 2.4.1, 2.4.2 |
+| frames, for testing | 16,000, of them 1,500 drawn at random; Gopher 55,000 and 5,000, each seen before an action of four game frames | sections 2.4.1, 2.4.2 |
 | Adam's learning rate, dropout, α | 1e-4, 0.5, 0.93; Gopher 0.8 | sections 2.4.1, 2.4.2 |
 | which network is kept | the one with the best test accuracy, α · (agrees with the DQN) + (1 − α) · (with the human); the last one is evaluated too | section 2.4.1 says test accuracy |
 | T, network, batch, epochs | 0.01, 256-256 with ReLU, in Gopher behind DQN's convolutions, 64, 100; Gopher 20 | ours, not given; benchmark/apple_alpha.sh compares T |
 | split | by frame: neighbours of a test frame are trained on; `--split episode` keeps whole episodes apart | section 2.4.1; ours |
 
 Demonstrations of Atari hold seeds and actions; their frames, 28 kB each as stacks of four, are made again in memory (1.6 GB, for
-a moment twice that).
+a moment twice that; three times with `--states own`).
 People play frame by frame (`record_human.py`): each of their frames is one to learn from, seen as an agent would see it there.
 The number of rewards in each life, the unit in which Table 2.2 seems to count (`benchmark/results/README.md`), is in `evaluation.json` beside
 the points.
@@ -138,7 +138,8 @@ class Args:
     demos: Path | None = None
     """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_synthetic_human/`"""
     demo_frames: int | None = None
-    """frames of the human, and with `--states own` of the DQN; default: 16,000 (section 2.4.1), Atari 55,000 (2.4.2)"""
+    """frames of the human, and with `--states own` of the DQN; default: 16,000 (section 2.4.1), Atari 55,000 (2.4.2), which are
+    what an agent sees before each action of four game frames, or a person at every game frame"""
     test_frames: int | None = None
     """frames kept for testing; default: 1,500 (section 2.4.1), Atari 5,000 (section 2.4.2)"""
     split: Literal["frame", "episode"] = "frame"
@@ -1150,9 +1151,9 @@ class Update:
 @torch.no_grad()
 def measure(student: Student, data: Data, args: Args) -> dict[str, float]:
     """Loss and agreement with each teacher on frames that are not trained on."""
-    rl_logits, he_logits = (
-        torch.cat([student(part) for part in obs.split(5_000)]) for obs in (data.rl_obs, data.he_obs)
-    )
+    he_logits = torch.cat([student(part) for part in data.he_obs.split(5_000)])
+    same = data.rl_obs is data.he_obs
+    rl_logits = he_logits if same else torch.cat([student(part) for part in data.rl_obs.split(5_000)])
     loss, _ = hybrid_loss(rl_logits, data.rl_labels, he_logits, data.he_actions, args.alpha)
     agrees_rl = (rl_logits.argmax(1) == data.rl_labels.argmax(1)).float().mean().item()
     agrees_he = (he_logits.argmax(1) == data.he_actions).float().mean().item()
@@ -1196,7 +1197,8 @@ def write_json(path: Path, content: dict) -> None:
 
 def arguments(args: Args) -> dict:
     """The arguments as JSON knows them: paths and infinity as strings, tuples as lists."""
-    return json.loads(json.dumps(asdict(args), default=str).replace("Infinity", '"inf"'))
+    values = {name: "inf" if value == math.inf else value for name, value in asdict(args).items()}
+    return json.loads(json.dumps(values, default=str))
 
 
 def save_checkpoint(run_dir: Path, state: dict) -> None:
@@ -1581,20 +1583,23 @@ def print_table(result: dict) -> None:
 # Training
 # ---------------------------------------------------------------------------------------------------------------------
 def start_wandb(args: Args, run_dir: Path) -> None:
-    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place."""
+    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place. Raises UsageError."""
     import wandb
 
     run_id = hashlib.sha256(str(run_dir.resolve()).encode()).hexdigest()[:16]
-    wandb.init(
-        project=args.wandb_project_name,
-        entity=args.wandb_entity,
-        sync_tensorboard=True,
-        config=asdict(args),
-        name=run_dir.name,
-        dir=run_dir,
-        id=run_id,
-        resume="allow",
-    )
+    try:
+        wandb.init(
+            project=args.wandb_project_name,
+            entity=args.wandb_entity,
+            sync_tensorboard=True,
+            config=asdict(args),
+            name=run_dir.name,
+            dir=run_dir,
+            id=run_id,
+            resume="allow",
+        )
+    except wandb.Error as error:  # no login, no connection, no such team
+        raise UsageError(f"--track: {first_line(error)}") from None
 
 
 def read_human(args: Args) -> list[dict[str, np.ndarray]]:
@@ -1624,18 +1629,23 @@ def label_frames(human: Frames, teacher: QNetwork | None, args: Args) -> Data:
 
 
 def play_teacher(teacher: QNetwork | AtariQNetwork, frames: int, args: Args) -> list[dict[str, np.ndarray]]:
-    """Episodes of the DQN, of so many frames at least; in Atari with a hundredth of random actions."""
+    """The first episodes of the DQN with so many frames; in Atari with a hundredth of random actions."""
     episodes: list[dict[str, np.ndarray]] = []
-    while sum(len(episode["actions"]) for episode in episodes) < frames:
-        seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, len(episodes) + i) for i in range(10)]
+    game, made, played = make_env(args.env_id), 0, 0
+    while made < frames:
+        seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, played + i) for i in range(10)]
         if is_atari(args.env_id):
             policy = greedy_policy(teacher, torch.device("cpu"))
             policy = epsilon_greedy_policy(policy, teacher.advantage.out_features, ATARI_EPSILON, seeds[0])
             new = play_atari(policy, functools.partial(make_env, args.env_id), seeds)
-            game = make_env(args.env_id)
-            episodes += [{**episode, "observations": watch(game, episode)} for episode in new]
         else:
-            episodes += play(numpy_greedy(teacher), args.env_id, seeds, keep=True)
+            new = play(numpy_greedy(teacher), args.env_id, seeds, keep=True)
+        played += len(new)
+        for episode in new:
+            if made < frames:  # frames of Atari fill the memory
+                seen = {"observations": watch(game, episode)} if is_atari(args.env_id) else {}
+                episodes.append({**episode, **seen})
+                made += len(episode["actions"])
     return episodes
 
 
@@ -1674,7 +1684,8 @@ def main(args: Args) -> int:
         return 0
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     bf16 = args.bf16 and has_bf16(device)
-    teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id, bf16)
+    on_cpu = args.bf16 and has_bf16(torch.device("cpu"))  # where the teacher labels the frames
+    teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id, on_cpu)
     human_episodes = read_human(args)
     torch.set_num_threads(args.num_threads)
     human = join_frames(human_episodes, args.demo_frames)
@@ -1711,7 +1722,8 @@ def main(args: Args) -> int:
     shapes = tuple(data.he_obs.shape[1:]), data.rl_labels.shape[1], args.hidden_size
     student = Student(*shapes, bf16).to(device)
     update = Update(student, args, data.at(training[: args.batch_size].to(device)))
-    arithmetic = f"{'compiled' if update.is_compiled else 'plain'} on {device.type}"
+    kind, numbers = "compiled" if update.is_compiled else "plain", "bfloat16" if bf16 else "float32"
+    arithmetic = f"{kind}, {numbers} on {device.type}"
     best = {"vector": update.vector.clone(), "accuracy": -1.0, "epoch": 0, **dict.fromkeys(("rl", "human"), 0.0)}
     epoch, training_seconds, offset = 0, 0.0, 0
     if checkpoint is not None:
@@ -1723,9 +1735,9 @@ def main(args: Args) -> int:
             was = checkpoint["arithmetic"]
             print(f"--resume: was {was}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     updates_csv = CsvLog(run_dir / "updates.csv", offset)
-    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
+    (run_dir / "result.json").unlink(missing_ok=True)
     writer = SummaryWriter(str(run_dir), purge_step=epoch + 1)
     progress = tqdm(total=last_epoch, initial=epoch, unit="epoch", disable=None)
     last_time = time.perf_counter()
@@ -1768,6 +1780,9 @@ def main(args: Args) -> int:
     stop.release()
     human_returns = [float(episode["rewards"].sum()) for episode in human_episodes]
     human_summary = {"player": "synthetic human" if args.demos is None else "recorded", **summary(human_returns)}
+    if is_atari(args.env_id):
+        lives = [number for episode in human_episodes for number in rewards_per_life(episode)]
+        human_summary["rewards_per_life"] = summary(lives)
     finish_run(student, update, args, run_dir, epoch, training_seconds, best, human_summary, writer)
     writer.close()
     return 0

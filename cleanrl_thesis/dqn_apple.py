@@ -800,7 +800,8 @@ def write_json(path: Path, content: dict) -> None:
 
 def arguments(args: Args) -> dict:
     """The arguments as JSON knows them: paths and infinity as strings, tuples as lists."""
-    return json.loads(json.dumps(asdict(args), default=str).replace("Infinity", '"inf"'))
+    values = {name: "inf" if value == math.inf else value for name, value in asdict(args).items()}
+    return json.loads(json.dumps(values, default=str))
 
 
 def save_checkpoint(run_dir: Path, state: dict) -> None:
@@ -1102,20 +1103,23 @@ LOG_INTERVAL = 10_000  # frames between rows of updates.csv
 
 
 def start_wandb(args: Args, run_dir: Path) -> None:
-    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place."""
+    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place. Raises UsageError."""
     import wandb
 
     run_id = hashlib.sha256(str(run_dir.resolve()).encode()).hexdigest()[:16]
-    wandb.init(
-        project=args.wandb_project_name,
-        entity=args.wandb_entity,
-        sync_tensorboard=True,
-        config=asdict(args),
-        name=run_dir.name,
-        dir=run_dir,
-        id=run_id,
-        resume="allow",
-    )
+    try:
+        wandb.init(
+            project=args.wandb_project_name,
+            entity=args.wandb_entity,
+            sync_tensorboard=True,
+            config=asdict(args),
+            name=run_dir.name,
+            dir=run_dir,
+            id=run_id,
+            resume="allow",
+        )
+    except wandb.Error as error:  # no login, no connection, no such team
+        raise UsageError(f"--track: {first_line(error)}") from None
 
 
 class Means:
@@ -1200,9 +1204,9 @@ def main(args: Args) -> int:
     global_step = iteration * frames_per_step
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
-    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
+    (run_dir / "result.json").unlink(missing_ok=True)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * frames_per_step, initial=global_step, unit="frame", disable=None)
     exploration_frames = args.exploration_fraction * args.total_timesteps

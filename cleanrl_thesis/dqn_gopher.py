@@ -19,7 +19,7 @@ machine the run ends with the same bytes.
 | repeated actions | with probability 0.25 | `ALE/*-v5`; thesis: not given |
 | games side by side | 8 | ours |
 
-Frames are game frames everywhere in chapter 2. The replay buffer holds every frame that the agent saw once: 7,063 bytes
+Frames are game frames here, an action lasting four. The replay buffer holds every frame that the agent saw once: 7,063 bytes
 for each, 7.8 GB with the room between two checkpoints, in a file that the operating system keeps in memory as far as it can.
 """
 
@@ -664,7 +664,7 @@ class Learner:
 # ---------------------------------------------------------------------------------------------------------------------
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
-CHECKPOINT_FORMAT = "dqn_gopher 1"
+CHECKPOINT_FORMAT = "dqn_gopher 2"
 FINISH = ("eval_episodes", "eval_epsilon", "capture_video", "save_model", "save_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -691,7 +691,8 @@ def write_json(path: Path, content: dict) -> None:
 
 def arguments(args: Args) -> dict:
     """The arguments as JSON knows them: paths and infinity as strings, tuples as lists."""
-    return json.loads(json.dumps(asdict(args), default=str).replace("Infinity", '"inf"'))
+    values = {name: "inf" if value == math.inf else value for name, value in asdict(args).items()}
+    return json.loads(json.dumps(values, default=str))
 
 
 def save_checkpoint(run_dir: Path, state: dict) -> None:
@@ -1002,20 +1003,23 @@ LOG_INTERVAL = 10_000  # frames between rows of updates.csv
 
 
 def start_wandb(args: Args, run_dir: Path) -> None:
-    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place."""
+    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place. Raises UsageError."""
     import wandb
 
     run_id = hashlib.sha256(str(run_dir.resolve()).encode()).hexdigest()[:16]
-    wandb.init(
-        project=args.wandb_project_name,
-        entity=args.wandb_entity,
-        sync_tensorboard=True,
-        config=asdict(args),
-        name=run_dir.name,
-        dir=run_dir,
-        id=run_id,
-        resume="allow",
-    )
+    try:
+        wandb.init(
+            project=args.wandb_project_name,
+            entity=args.wandb_entity,
+            sync_tensorboard=True,
+            config=asdict(args),
+            name=run_dir.name,
+            dir=run_dir,
+            id=run_id,
+            resume="allow",
+        )
+    except wandb.Error as error:  # no login, no connection, no such team
+        raise UsageError(f"--track: {first_line(error)}") from None
 
 
 class Means:
@@ -1093,15 +1097,18 @@ def main(args: Args) -> int:
         vars(means).update(checkpoint["means"])
         if not players.load_state_dict(checkpoint["players"]):
             print("--resume: a replayed episode differs (another machine?), goes on with it", file=sys.stderr)
-    if checkpoint and checkpoint["device"] != device.type:
-        print(f"--resume: was on {checkpoint['device']}, goes on on {device.type}: bytes will differ", file=sys.stderr)
+    arithmetic = f"{'bfloat16' if bf16 else 'float32'} on {device.type}"
+    if checkpoint and checkpoint["arithmetic"] != arithmetic:
+        print(
+            f"--resume: was on {checkpoint['arithmetic']}, goes on on {arithmetic}: bytes will differ", file=sys.stderr
+        )
     greedy = greedy_policy(learner.agent, device)
     global_step = iteration * frames_per_step
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
-    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
+    (run_dir / "result.json").unlink(missing_ok=True)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * frames_per_step, initial=global_step, unit="frame", disable=None)
     exploration_frames = args.exploration_fraction * args.total_timesteps
@@ -1148,7 +1155,7 @@ def main(args: Args) -> int:
         if crossed or stop.received or iteration == last_iteration:
             state = {
                 "args": arguments(args),
-                "device": device.type,
+                "arithmetic": arithmetic,
                 "iteration": iteration,
                 "training_seconds": training_seconds,
                 "offsets": {"episodes": episodes_csv.sync(), "updates": updates_csv.sync()},

@@ -324,9 +324,7 @@ def read_demonstrations(folder: Path, side: int, flag: str = "--demos") -> tuple
     return [read_episode(folder / name, checksum, side, flag) for name, checksum in sorted(files.items())], recorded
 
 
-def split_episodes(
-    episodes: list[Episode], args: Args, flag: str = "--demos"
-) -> tuple[list[Episode], list[Episode]]:
+def split_episodes(episodes: list[Episode], args: Args, flag: str = "--demos") -> tuple[list[Episode], list[Episode]]:
     """The first episodes with `--train-pairs` steps, and those held out after them. Raises UsageError where there are too few."""
     ends = np.cumsum([len(episode.actions) for episode in episodes])
     first = int(np.searchsorted(ends, args.train_pairs)) + 1
@@ -930,7 +928,8 @@ def write_json(path: Path, content: dict) -> None:
 
 def arguments(args: Args) -> dict:
     """The arguments as JSON knows them: paths and infinity as strings, tuples as lists."""
-    return json.loads(json.dumps(asdict(args), default=str).replace("Infinity", '"inf"'))
+    values = {name: "inf" if value == math.inf else value for name, value in asdict(args).items()}
+    return json.loads(json.dumps(values, default=str))
 
 
 def save_checkpoint(run_dir: Path, state: dict) -> None:
@@ -1213,20 +1212,23 @@ def print_table(segmentation: dict) -> None:
 
 
 def start_wandb(args: Args, run_dir: Path) -> None:
-    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place."""
+    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place. Raises UsageError."""
     import wandb
 
     run_id = hashlib.sha256(str(run_dir.resolve()).encode()).hexdigest()[:16]
-    wandb.init(
-        project=args.wandb_project_name,
-        entity=args.wandb_entity,
-        sync_tensorboard=True,
-        config=asdict(args),
-        name=run_dir.name,
-        dir=run_dir,
-        id=run_id,
-        resume="allow",
-    )
+    try:
+        wandb.init(
+            project=args.wandb_project_name,
+            entity=args.wandb_entity,
+            sync_tensorboard=True,
+            config=asdict(args),
+            name=run_dir.name,
+            dir=run_dir,
+            id=run_id,
+            resume="allow",
+        )
+    except wandb.Error as error:  # no login, no connection, no such team
+        raise UsageError(f"--track: {first_line(error)}") from None
 
 
 def fingerprint(episodes: list[Episode]) -> str:
@@ -1280,9 +1282,9 @@ def main(args: Args) -> int:
     if checkpoint and update < last_update and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     updates_csv = CsvLog(run_dir / "updates.csv", offset)
-    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
+    (run_dir / "result.json").unlink(missing_ok=True)
     writer = SummaryWriter(str(run_dir), purge_step=update + 1)
     progress = tqdm(total=last_update, initial=update, unit="update", disable=None)
     last_time = time.perf_counter()

@@ -36,7 +36,7 @@ keeps those, and a resumed run plays the unfinished episode again instead of cop
 # dependencies = [
 #     "gymnasium[mujoco]>=1.2",
 #     "matplotlib>=3.9",
-#     "mujoco>=3.3",
+#     "mujoco>=3.3.6",
 #     "numpy>=2.0",
 #     "safetensors>=0.4",
 #     "tensorboard>=2.17",
@@ -177,7 +177,8 @@ class Args:
     kl_timing: Literal["before-last-step", "after-iteration"] | None = None
     """when iteration k is measured; default as run: after-iteration with --kle-rollback, else before-last-step"""
     rollback: Literal["policy", "policy-value", "policy-moments"] = "policy-value"
-    """what KLE-Rollback restores: the policy (as printed), with the value function (as run), with its Adam moments"""
+    """what KLE-Rollback restores: the policy (as printed), with the value function (as run), with its Adam moments (whose step
+    count, shared with the value function, runs on)"""
     norm_obs: bool = True
     """normalise observations by running statistics (section 4.3.2, item 3)"""
     norm_reward: bool = True
@@ -268,7 +269,8 @@ def complete_args(args: Args) -> Args:
     args.num_iterations = args.total_timesteps // args.batch_size
     rest, flag = args.batch_size % args.num_minibatches, "--num-minibatches"
     require(rest == 0, flag, args.num_minibatches, f"must divide the batch of {args.batch_size} steps")
-    enough = args.minibatch_size >= 2 or not args.norm_adv
+    normalised = args.batch_size if args.norm_adv_scope == "batch" else args.minibatch_size
+    enough = normalised >= 2 or not args.norm_adv
     require(enough, flag, args.num_minibatches, "must leave at least 2 steps to normalise advantages over")
     allowed = f"must be at least one batch, {args.batch_size} steps"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
@@ -1208,7 +1210,8 @@ def write_json(path: Path, content: dict) -> None:
 
 def arguments(args: Args) -> dict:
     """The arguments as JSON knows them: paths and infinity as strings, tuples as lists."""
-    return json.loads(json.dumps(asdict(args), default=str).replace("Infinity", '"inf"'))
+    values = {name: "inf" if value == math.inf else value for name, value in asdict(args).items()}
+    return json.loads(json.dumps(values, default=str))
 
 
 def save_checkpoint(run_dir: Path, state: dict) -> None:
@@ -1478,20 +1481,23 @@ def print_table(result: dict) -> None:
 # Training
 # ---------------------------------------------------------------------------------------------------------------------
 def start_wandb(args: Args, run_dir: Path) -> None:
-    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place."""
+    """Mirror TensorBoard to Weights and Biases; a resumed run goes on in the same place. Raises UsageError."""
     import wandb
 
     run_id = hashlib.sha256(str(run_dir.resolve()).encode()).hexdigest()[:16]
-    wandb.init(
-        project=args.wandb_project_name,
-        entity=args.wandb_entity,
-        sync_tensorboard=True,
-        config=asdict(args),
-        name=run_dir.name,
-        dir=run_dir,
-        id=run_id,
-        resume="allow",
-    )
+    try:
+        wandb.init(
+            project=args.wandb_project_name,
+            entity=args.wandb_entity,
+            sync_tensorboard=True,
+            config=asdict(args),
+            name=run_dir.name,
+            dir=run_dir,
+            id=run_id,
+            resume="allow",
+        )
+    except wandb.Error as error:  # no login, no connection, no such team
+        raise UsageError(f"--track: {first_line(error)}") from None
 
 
 def main(args: Args) -> int:
@@ -1541,9 +1547,9 @@ def main(args: Args) -> int:
     global_step = iteration * args.batch_size
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
-    (run_dir / "result.json").unlink(missing_ok=True)
     if args.track:
         start_wandb(args, run_dir)
+    (run_dir / "result.json").unlink(missing_ok=True)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * args.batch_size, initial=global_step, unit="step", disable=None)
     last_time = time.perf_counter()

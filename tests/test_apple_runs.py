@@ -133,7 +133,7 @@ def test_compiled_through_the_command_line(script, flags, tmp_path):
 
 def test_a_plain_run_says_so(teacher, student):
     states = [torch.load(folder / "checkpoint.pt", weights_only=True) for folder in (teacher, student)]
-    assert [state["arithmetic"] for state in states] == ["PlainUpdate on cpu", "plain on cpu"]
+    assert [state["arithmetic"] for state in states] == ["PlainUpdate on cpu", "plain, float32 on cpu"]
 
 
 def test_updates_and_target_network_come_when_they_should(teacher, tmp_path):

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import pty
 import shutil
@@ -292,6 +293,22 @@ def test_weights_and_biases_offline(tmp_path):
     pytest.importorskip("wandb")
     run(*SMALL, "--track", "--run-dir", "run", cwd=tmp_path, WANDB_MODE="offline", WANDB_SILENT="true")
     assert list((tmp_path / "run" / "wandb").glob("offline-run-*/*.wandb"))
+
+
+def test_weights_and_biases_without_a_login_is_one_line_and_loses_no_result(copied_run, tmp_path):
+    pytest.importorskip("wandb")
+    flags = [*SMALL, "--track", "--run-dir", copied_run, "--resume", "--eval-episodes", 3]
+    home = {"HOME": str(tmp_path), "WANDB_API_KEY": "", "WANDB_MODE": "online"}
+    done = run(*flags, cwd=tmp_path, code=2, **home)
+    assert done.stderr.startswith("error: --track: ") and done.stderr.count("\n") == 1
+    assert (copied_run / "result.json").exists()
+
+
+def test_a_name_may_hold_the_word_infinity(tmp_path):
+    args = ppo.Args(exp_name="ToInfinity", run_dir=tmp_path / "Infinity", max_grad_norm=math.inf)
+    written = ppo.arguments(args)
+    assert written["exp_name"] == "ToInfinity" and written["run_dir"] == str(tmp_path / "Infinity")
+    assert written["max_grad_norm"] == "inf"
 
 
 def test_tensorboard_has_what_the_csv_has(small_run):

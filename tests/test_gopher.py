@@ -586,6 +586,12 @@ def test_recordings_of_gopher_are_played_again_and_learned_from(student, pixel_t
     flags = [*SMALL_DISTILL, "--teacher", pixel_teacher, "--bf16", "--demos", demos, "--run-dir", "run"]
     run(*flags, cwd=tmp_path, script=DISTILL)
     assert (tmp_path / "run" / "updates.csv").read_bytes() == (student / "updates.csv").read_bytes()
+    human, paid, lives = json.loads((tmp_path / "run" / "result.json").read_text())["human"], 0, 0
+    for path in demos.glob("*.npz"):
+        with np.load(path, allow_pickle=False) as arrays:
+            paid, lives = paid + (arrays["rewards"] > 0).sum(), lives + 1 + (np.diff(arrays["lives"])[:-1] < 0).sum()
+    assert human["player"] == "recorded" and human["rewards_per_life"]["episodes"] == lives
+    assert human["rewards_per_life"]["mean"] == pytest.approx(paid / lives)
 
 
 def test_frames_of_a_person_are_what_an_agent_would_see(student):
@@ -637,6 +643,15 @@ def test_a_teacher_that_reads_the_memory_is_refused(small, tmp_path, monkeypatch
     assert_refused(distill, capsys, flags, ["--teacher", "another shape"])
     flags = ["--env-id", "ALE/Gopher-v5", "--teacher", tmp_path / "none", "--run-dir", "run"]
     assert_refused(distill, capsys, flags, ["--teacher", "dqn_gopher.py --save-model"])
+
+
+def test_no_more_of_the_dqns_play_is_made_into_frames_than_is_learned_from(monkeypatch):
+    """Ten games are played at once; the frames of one are made only while there are too few."""
+    watched, teacher = [], dqn.AtariQNetwork((4, 84, 84), 8, 32, True)
+    monkeypatch.setattr(distill, "play_atari", lambda policy, make, seeds: [{"actions": np.zeros(100)} for _ in seeds])
+    monkeypatch.setattr(distill, "watch", lambda game, episode: watched.append(episode))
+    episodes = distill.play_teacher(teacher, 1_250, distill.Args(env_id="ALE/Gopher-v5"))
+    assert len(episodes) == len(watched) == 13
 
 
 def test_states_of_the_dqn_itself(pixel_teacher, tmp_path):
