@@ -86,7 +86,7 @@ class Args:
     export_minari: str | None = None
     """write the recordings as the Minari dataset of this id, instead of recording (`pip install "minari[hdf5]"`)"""
     seed: int | None = None
-    """seed of the episodes' seeds; default: fresh ones"""
+    """seed of the episodes' seeds, with the number of those in the folder; default: fresh ones"""
     track_name: str = "meadow"
     """road of the driving task: meadow, speedway, hills or city"""
     brake: bool = True
@@ -371,7 +371,8 @@ class Recordings:
         paths = sorted(path for path in folder.glob("episode_*.npz") if re.fullmatch(r"episode_\d{5}\.npz", path.name))
         manifest = folder / "manifest.json"
         if not manifest.exists():
-            require(not any(folder.iterdir()), "--out", folder, "holds other files than recordings")
+            only_torn = all(path.suffix == ".tmp" for path in folder.iterdir())
+            require(only_torn, "--out", folder, "holds other files than recordings")
             return recordings
         try:
             saved = json.loads(manifest.read_text())
@@ -598,12 +599,14 @@ async def serve_player(websocket, game: Game, recordings: Recordings | None, see
             recorded = order == "record" and recordings is not None
             episode = await play_episode(game, player, int(seeds.spawn(1)[0].generate_state(1)[0]))
             if episode is not None and recorded:
+                before = len(recordings.files)
                 try:
                     recordings.add(episode)
                 except OSError as error:
                     print(f"error: --out {recordings.folder}: {first_line(error)}", file=sys.stderr)
-                    await player.tell(kind="over", score=None, recorded=False, trouble=first_line(error))
-                    continue
+                    if len(recordings.files) == before:  # else the round is kept, only the manifest lacks it
+                        await player.tell(kind="over", score=None, recorded=False, trouble=first_line(error))
+                        continue
             score = None if episode is None else float(episode["rewards"].sum())
             await player.tell(kind="over", score=score, recorded=recorded and episode is not None)
     except WebSocketDisconnect:
@@ -620,6 +623,7 @@ async def serve_player(websocket, game: Game, recordings: Recordings | None, see
 # ---------------------------------------------------------------------------------------------------------------------
 def allowed_hosts(host: str) -> set[str] | None:
     """Names by which browsers may call this server, against rebinding of foreign names; None: all."""
+    host = host.lower()  # as browsers write it
     return None if host in ("0.0.0.0", "::") else {"127.0.0.1", "localhost", "[::1]", host, f"[{host}]"}
 
 
@@ -630,7 +634,8 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     page, hosts, busy = Path(__file__).with_suffix(".html").read_text(), allowed_hosts(args.host), asyncio.Lock()
-    seeds = np.random.SeedSequence(None if args.seed is None else [args.seed, HUMAN_STREAM])
+    begun = 0 if recordings is None else len(recordings.files)  # a folder that is added to gets other rounds
+    seeds = np.random.SeedSequence(None if args.seed is None else [args.seed, HUMAN_STREAM, begun])
     about = {"title": args.env_id, "rules": game.rules, "keys": game.keys, "unit": game.unit}
 
     def is_known(connection: HTTPConnection) -> bool:

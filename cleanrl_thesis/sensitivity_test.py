@@ -398,14 +398,12 @@ def prepare(args: Args) -> int:
     env_id, fps = next(iter(plays.values())).env_id, next(iter(plays.values())).fps
     seconds = args.seconds or (30 if env_id == "TorcsLike-v0" else 15)
     require(seconds * fps >= 1, "--seconds", seconds, f"must be at least a frame, 1/{fps:g} s")
-    rng, cuts = np.random.default_rng(args.seed), {}
-    for name, play in plays.items():
-        count = 1 if name == "practice" else args.clips
-        cuts[name] = choose_windows(play.lengths, round(seconds * fps), count, rng)
-        allowed = f"has {len(cuts[name])} clips of {seconds:g} s, needs {count}: --clips or --seconds may be less"
-        require(len(cuts[name]) == count, "--prepare", f"{name}={sources[name]}", allowed)
-    args.videos.parent.mkdir(parents=True, exist_ok=True)
-    new = Path(tempfile.mkdtemp(prefix=f"{args.videos.name}.", dir=args.videos.parent))
+    cuts = choose_cuts(plays, sources, args, seconds)
+    try:
+        args.videos.parent.mkdir(parents=True, exist_ok=True)
+        new = Path(tempfile.mkdtemp(prefix=f"{args.videos.name}.", dir=args.videos.parent))
+    except OSError as error:
+        raise UsageError(f"--videos {args.videos}: cannot be written: {error.strerror}") from None
     try:
         cut_clips(new, args, plays, cuts, seconds)
         if args.videos.exists():
@@ -415,6 +413,23 @@ def prepare(args: Args) -> int:
     finally:
         shutil.rmtree(new, ignore_errors=True)
     return 0
+
+
+def choose_cuts(plays: dict[str, Play], sources: dict[str, Path], args: Args, seconds: float) -> dict[str, list]:
+    """Where the clips of each agent begin, and that for practice, of an episode that no other clip is of. Raises UsageError."""
+    rng, cuts, shown = np.random.default_rng(args.seed), {}, set()
+    for name, play in plays.items():
+        is_practice = name == "practice"
+        free = {path: length for path, length in play.lengths.items() if not is_practice or path.resolve() not in shown}
+        count = 1 if is_practice else args.clips
+        cuts[name] = choose_windows(free, round(seconds * play.fps), count, rng)
+        shown |= {path.resolve() for path, _ in cuts[name]}
+        if is_practice:
+            allowed = f"has no episode of {seconds:g} s of which the agents' clips show nothing: --clips may be less"
+            require(len(cuts[name]) == 1, "--practice", args.practice, allowed)
+        allowed = f"has {len(cuts[name])} clips of {seconds:g} s, needs {count}: --clips or --seconds may be less"
+        require(len(cuts[name]) == count, "--prepare", f"{name}={sources[name]}", allowed)
+    return cuts
 
 
 def cut_clips(folder: Path, args: Args, plays: dict[str, Play], cuts: dict[str, list], seconds: float) -> None:
@@ -698,10 +713,13 @@ def export(args: Args) -> int:
     require(bool(answers), "--db", args.db, "holds no answers yet")
     rows = count_verdicts(answers, args.seed)
     names = ("participant", "agent", "verdict", "position", "clip", "comment", "age", "gender")
-    args.export.mkdir(parents=True, exist_ok=True)
-    write_csv(args.export / "identified_as_human.csv", rows)
     comments = [{name: guarded(value) for name, value in zip(names, answer)} for answer in answers]
-    write_csv(args.export / "comments.csv", comments)
+    try:
+        args.export.mkdir(parents=True, exist_ok=True)
+        write_csv(args.export / "identified_as_human.csv", rows)
+        write_csv(args.export / "comments.csv", comments)
+    except OSError as error:
+        raise UsageError(f"--export {args.export}: cannot be written: {error.strerror}") from None
     print(f"{'agent':<24}identified as human      share and 95% interval   participants")
     for row in rows:
         share = f"{row['share']:.0%}  [{row['low']:.0%}, {row['high']:.0%}]"
@@ -720,6 +738,7 @@ GENDERS = Literal["female", "male", "another"]
 
 def allowed_hosts(host: str) -> set[str] | None:
     """Names by which browsers may call this server, against rebinding of foreign names; None: all."""
+    host = host.lower()  # as browsers write it
     return None if host in ("0.0.0.0", "::") else {"127.0.0.1", "localhost", "[::1]", host, f"[{host}]"}
 
 

@@ -335,6 +335,34 @@ def test_recordings_go_on_where_they_stopped(tmp_path, capsys):
     ]
 
 
+def test_a_disk_that_is_full_loses_no_round_that_is_kept(at_once, tmp_path, monkeypatch):
+    """The episode cannot be written, then it can, and only the manifest cannot."""
+    full, write = ["episode"], record.write_whole
+
+    def write_or_fail(path: Path, content: bytes) -> None:
+        if path.name.startswith(full[0]):
+            raise OSError(28, "No space left on device")
+        write(path, content)
+
+    monkeypatch.setattr(record, "write_whole", write_or_fail)
+    args = make_args(folder=tmp_path / "anna")
+    browser, told = Browser(args), []
+    with browser.connect() as socket:
+        for full[0] in ("episode", "none", "manifest"):
+            told.append(browser.play(socket, "record")["recorded"])
+    kept = record.Recordings.open(args.out, record.about_recordings(args, record.make_game(args)))
+    assert told == [False, True, True] and len(kept.files) == 2
+
+
+def test_a_folder_that_is_added_to_gets_other_rounds(at_once, tmp_path):
+    for _ in range(2):
+        browser = Browser(make_args(folder=tmp_path / "anna"))
+        with browser.connect() as socket:
+            browser.play(socket, "record")
+    seeds = [int(np.load(path)["seed"]) for path in sorted((tmp_path / "anna").glob("*.npz"))]
+    assert len(seeds) == 2 and seeds[0] != seeds[1]
+
+
 @pytest.mark.parametrize(
     "flags, damage, words",
     [

@@ -188,8 +188,8 @@ def record_apple(folder: Path, count: int = 2) -> Path:
 
 
 def test_prepare_cuts_recordings_runs_and_videos(tmp_path, capsys):
-    """A folder of demonstrations, a run that has some, and for practice a third one; the frames are those of the game."""
-    record_apple(tmp_path / "anna")
+    """A folder of demonstrations, of which the rest is for practice, and a run that has some; the frames are those of the game."""
+    record_apple(tmp_path / "anna", 3)
     (tmp_path / "run").mkdir()
     record_apple(tmp_path / "run" / "demos")
     flags = ["--videos", tmp_path / "out", "--clips", 2, "--seconds", 1, "--prepare"]
@@ -200,6 +200,9 @@ def test_prepare_cuts_recordings_runs_and_videos(tmp_path, capsys):
     assert made == sorted([*clips, "practice.mp4", "prepared.json", "rules.txt"])
     prepared = json.loads((tmp_path / "out" / "prepared.json").read_text())
     cut = next(each for each in prepared["clips"] if each["clip"] == "human/000.mp4")
+    shown = {each["from"] for each in prepared["clips"] if each["clip"].startswith("human/")}
+    (practised,) = (each["from"] for each in prepared["clips"] if each["clip"] == "practice.mp4")
+    assert len(shown) == 2 and practised not in shown
     with np.load(tmp_path / "anna" / cut["from"]) as arrays:
         env = distill.make_env("AppleGame-v0", "rgb_array")
         env.reset(seed=int(arrays["seed"]))
@@ -211,6 +214,20 @@ def test_prepare_cuts_recordings_runs_and_videos(tmp_path, capsys):
     flags[1], flags[5] = tmp_path / "again", 0.5
     assert study.cli([str(flag) for flag in flags]) == 0
     assert study.describe_clip((tmp_path / "again" / "a" / "000.mp4").read_bytes())[0] == 0.5
+
+
+def test_practice_needs_an_episode_of_its_own(tmp_path, capsys):
+    record_apple(tmp_path / "anna")
+    flags = ["--videos", tmp_path / "out", "--clips", 2, "--seconds", 1, "--prepare", f"a={tmp_path / 'anna'}"]
+    assert_refused(study, capsys, [*flags, "--practice", tmp_path / "anna"], ["--practice", "no episode of 1 s"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path, capsys):
+    record_apple(tmp_path / "anna")
+    (tmp_path / "file").write_text("")
+    flags = ["--clips", 2, "--seconds", 1, "--prepare", f"a={tmp_path / 'anna'}"]
+    assert_refused(study, capsys, ["--videos", tmp_path / "file" / "out", *flags], ["--videos", "cannot be written"])
 
 
 def test_an_agents_own_script_is_asked_for_episodes(tmp_path):
@@ -452,6 +469,7 @@ def test_comments_stay_text_and_no_formula(videos, tmp_path):
         trial = client.post("/answer", json=answer).json()
     assert [why for (why,) in rows(db, "SELECT why FROM trials ORDER BY position")] == comments
     assert study.cli(["--db", str(db), "--export", str(tmp_path)]) == 0
+    assert study.cli(["--db", str(db), "--export", str(db / "results")]) == 2  # no folder can be in a file
     with open(tmp_path / "comments.csv", newline="") as file:
         found = [row["comment"] for row in csv.DictReader(file)]
     assert found == [
@@ -479,6 +497,7 @@ def test_it_listens_on_this_machine_unless_told_otherwise():
         with pytest.raises(study.UsageError, match="cannot be listened on"):
             study.listen("127.0.0.1", port)
     assert study.allowed_hosts("0.0.0.0") is None
+    assert "mylab.local" in study.allowed_hosts("MyLab.local")
 
 
 @pytest.mark.parametrize(
