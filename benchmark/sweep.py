@@ -287,7 +287,7 @@ def settle(args: Args, sweep: Sweep, run: Run, code: int) -> bool:
             sweep.waiting.appendleft(run)
         else:
             sweep.failed[run] = code
-            if run == sweep.first:
+            if run == sweep.first and not sweep.done:
                 sweep.stopped = "the first run failed, so the others were stopped"
     return is_busy
 
@@ -374,7 +374,8 @@ class Signals:
 
     def install(self) -> None:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda number, frame: self.received.append(number))
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # as `nohup` leaves it
+                signal.signal(number, lambda number, frame: self.received.append(number))
 
     def obey(self, sweep: Sweep) -> None:
         """Pass on what has come since."""
@@ -471,13 +472,18 @@ def chunks(items: list[int], size: int) -> Iterator[list[int]]:
         yield items[begin : begin + size]
 
 
-def submit(args: Args, runs: list[Run]) -> int:
-    """Submit what is not done as arrays of at most `--slurm-chunk` tasks, one after the other. Raises UsageError."""
+def free_job_name(args: Args) -> str:
+    """The name of a sweep's jobs. Raises UsageError where some are queued, which still read the manifest."""
     folder = str(args.runs.resolve())
     require(not re.search(r"\s", folder), f"--runs {args.runs}: must be without blanks for Slurm")
     job_name = f"{args.runs.name}-{args.name}-{hashlib.sha256(folder.encode()).hexdigest()[:6]}"
     queued = slurm("squeue", "--me", "--noheader", "--format=%A", f"--name={job_name}")
     require(not queued, f"--name {args.name}: jobs of this sweep are still queued, squeue --name={job_name}")
+    return job_name
+
+
+def submit(args: Args, runs: list[Run], job_name: str) -> int:
+    """Submit what is not done as arrays of at most `--slurm-chunk` tasks, one after the other. Raises UsageError."""
     left = [i for i, run in enumerate(runs) if not is_done(read_result(args.runs / run.name), args.stop_at)]
     template = args.slurm_template_path.read_text()
     for part in ("slurm", "logs"):
@@ -490,7 +496,7 @@ def submit(args: Args, runs: list[Run]) -> int:
             "name": job_name,
             "array": f"0-{len(lines) - 1}%{args.workers}",
             "lines": " ".join(map(str, lines)),
-            "logs": f"{folder}/logs",
+            "logs": f"{args.runs.resolve()}/logs",
             "retries": str(args.retries),
             "command": shlex.join([*one, "--only"]),
         }
@@ -510,8 +516,9 @@ def main(args: Args) -> int:
     runs = make_runs(args)
     template = args.slurm_template_path
     require(template is None or template.is_file(), f"--slurm-template-path {template}: no such file")
+    job_name = "" if template is None else free_job_name(args)
     open_manifest(args, runs)
-    return run_here(args, runs) if template is None else submit(args, runs)
+    return run_here(args, runs) if template is None else submit(args, runs, job_name)
 
 
 def cli() -> int:

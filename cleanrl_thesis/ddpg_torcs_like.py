@@ -42,6 +42,7 @@ car with the numbers of TORCS' car1-trb1, and roads of the same length, width an
 # ]
 # ///
 import contextlib
+import copy
 import csv
 import fcntl
 import functools
@@ -124,7 +125,8 @@ class Args:
     track_name: str = "meadow"
     """the road of TorcsLike-v0: meadow, speedway, hills or city"""
     reward: Literal["distance", "speed"] = "distance"
-    """TorcsLike-v0: metres of progress (section 2.4.3), or the speed along the road in km/h; -1 for a crash"""
+    """TorcsLike-v0: metres of progress (section 2.4.3), or the speed along the road in km/h; -1 for a crash; evaluations, the
+    policy that is kept and demonstrations count metres in any case"""
     brake: bool = True
     """TorcsLike-v0: negative throttle brakes; off: it coasts, as in gym_torcs"""
     total_timesteps: int = 10_000_000
@@ -654,9 +656,9 @@ class TorcsLikeEnv(gym.Env, TorcsRules):
     """One car. The end after 60 s is a truncation."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
-    observation_space, action_space = TORCS_OBSERVATIONS, TORCS_ACTIONS
 
     def __init__(self, render_mode=None, track="meadow", reward="distance", brake=True, max_laps=None):
+        self.observation_space, self.action_space = copy.deepcopy((TORCS_OBSERVATIONS, TORCS_ACTIONS))
         self.render_mode, self.car = render_mode, np.zeros(1, int)
         self.set_rules(1, track, reward, brake, max_laps)
 
@@ -683,16 +685,18 @@ class TorcsLikeVectorEnv(gym.vector.VectorEnv, TorcsRules):
         "render_fps": FPS,
         "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP,
     }
-    single_observation_space, single_action_space = TORCS_OBSERVATIONS, TORCS_ACTIONS
 
     def __init__(self, num_envs=1, render_mode=None, track="meadow", reward="distance", brake=True, max_laps=None):
         self.num_envs, self.render_mode, self.all_cars = num_envs, render_mode, np.arange(num_envs)
+        self.single_observation_space, self.single_action_space = copy.deepcopy((TORCS_OBSERVATIONS, TORCS_ACTIONS))
         self.observation_space = gym.vector.utils.batch_space(TORCS_OBSERVATIONS, num_envs)
         self.action_space = gym.vector.utils.batch_space(TORCS_ACTIONS, num_envs)
         self.set_rules(num_envs, track, reward, brake, max_laps)
         self.seed_cars(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_cars(self, seeds: list[int]) -> None:
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cars")
         self.generators = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
 
     def begin(self, cars: np.ndarray) -> None:
@@ -793,7 +797,7 @@ def make_env(env_id: str, render_mode: str | None = None, **options) -> gym.Env:
 
 
 def is_driving(env_id: str) -> bool:
-    return env_id.split(":")[-1] == "TorcsLike-v0"
+    return env_id.split(":")[-1] in ("TorcsLike", "TorcsLike-v0")
 
 
 def env_options(args: Args) -> dict:
@@ -956,7 +960,7 @@ class GymPlayers:
             for action in state["actions"][i].numpy():
                 self.obs[i], reward, _, _, _ = env.step(action)
                 self.actions[i].append(action)
-                self.returns[i] += reward
+                self.returns[i] += float(reward)  # as in `step`, whose rewards are float64
         return np.array_equal(self.obs, state["obs"].numpy())
 
 
@@ -1214,7 +1218,7 @@ class Best:
 
     def __init__(self, optimizer: "FlatAdam", norm: RunningNorm):
         self.optimizer, self.norm = optimizer, norm
-        self.actor, self.scale = optimizer.vector[: optimizer.actor_size].clone(), norm.scale.clone()
+        self.vector, self.scale = optimizer.vector.clone(), norm.scale.clone()
         self.step, self.score, self.last_score = 0, -math.inf, math.nan
 
     def consider(self, args: Args, space: gym.spaces.Box, step: int) -> None:
@@ -1225,21 +1229,21 @@ class Best:
         self.last_score, score = float(np.mean(returns)), float(np.mean(returns) - np.std(returns))
         if score >= self.score:
             self.step, self.score = step, score
-            self.actor.copy_(self.optimizer.vector[: self.optimizer.actor_size])
+            self.vector.copy_(self.optimizer.vector)
             self.scale.copy_(self.norm.scale)
 
     def restore(self) -> None:
-        """Make it the agent's; the last one stays where there was no evaluation."""
+        """Make it the agent's, with the critic of that time; the last one stays where there was no evaluation."""
         if self.step:
-            self.optimizer.vector[: self.optimizer.actor_size] = self.actor
+            self.optimizer.vector.copy_(self.vector)
             self.norm.set_scale(self.scale)
 
     def state_dict(self) -> dict:
-        names = ("actor", "scale", "step", "score", "last_score")
+        names = ("vector", "scale", "step", "score", "last_score")
         return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict) -> None:
-        self.actor.copy_(state["actor"])
+        self.vector.copy_(state["vector"])
         self.scale.copy_(state["scale"])
         self.step, self.score, self.last_score = state["step"], state["score"], state["last_score"]
 
@@ -1417,7 +1421,7 @@ class Update:
 # ---------------------------------------------------------------------------------------------------------------------
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
-CHECKPOINT_FORMAT = "ddpg_torcs_like 1"
+CHECKPOINT_FORMAT = "ddpg_torcs_like 2"
 FINISH = ("eval_episodes", "capture_video", "save_model", "save_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -1526,6 +1530,15 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
         return False
     result, wanted = json.loads((run_dir / "result.json").read_text()), arguments(args)
     return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
+
+
+def forget_end(run_dir: Path, goes_on: bool) -> None:
+    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
+    for pattern in ("result.json", *saved):
+        for path in run_dir.glob(pattern):
+            if path.parent.name != "demos_synthetic_human":
+                path.unlink()
 
 
 class CsvLog:
@@ -1685,7 +1698,7 @@ def make_policy(optimizer: FlatAdam, norm: RunningNorm, space: gym.spaces.Box):
 
 def scaled(actions: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
     """Actions (N, A) from [-1, 1] to the bounds of the environment's."""
-    return space.low + (actions + 1) / 2 * (space.high - space.low)
+    return (space.low + (actions + 1) / 2 * (space.high - space.low)).astype(np.float32)
 
 
 def evaluate(policy, args: Args, run_dir: Path) -> dict:
@@ -1761,7 +1774,8 @@ def plot_learning_curve(run_dir: Path, args: Args, evaluation: dict) -> None:
         axes.plot(steps[window - 1 :], means, color="tab:blue", label=f"mean of {window} episodes")
     level = evaluation["mean"]
     label = f"evaluation (without noise, {args.eval_episodes} episodes): {level:,.1f}"
-    axes.axhline(level, color="tab:orange", linestyle="--", label=label)
+    if not (is_driving(args.env_id) and args.reward == "speed"):  # the evaluation counts metres
+        axes.axhline(level, color="tab:orange", linestyle="--", label=label)
     where = f"{args.env_id}, {args.track_name}" if is_driving(args.env_id) else args.env_id
     axes.set_title(f"{where}, DDPG, seed {args.seed}")
     axes.set_xlabel("steps")
@@ -1902,7 +1916,7 @@ def main(args: Args) -> int:
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
     if args.track:
         start_wandb(args, run_dir)
-    (run_dir / "result.json").unlink(missing_ok=True)
+    forget_end(run_dir, iteration < last_iteration)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * args.rollout_steps, initial=global_step, unit="step", disable=None)
     last_time = time.perf_counter()
@@ -1926,7 +1940,7 @@ def main(args: Args) -> int:
                 charts = {"charts/episodic_return": episodic_return, "charts/episodic_length": length}
                 add_scalars(writer, charts, global_step)
                 progress.set_postfix_str(f"return {episodic_return:.1f}", refresh=False)
-            if (global_step // at_once) % perturb_interval == 0:
+            if args.noise == "parameter" and (global_step // at_once) % perturb_interval == 0:
                 for i in range(args.num_envs):
                     explorer.begin(i)
 
@@ -1936,6 +1950,8 @@ def main(args: Args) -> int:
                 distance = explorer.adapt(norm(buffer.sample(args.batch_size, rng).numpy()[:, :obs_dim]))
             means.add(update(buffer.sample(args.batch_size, rng).to(device)))
             updates += 1
+        if not optimizer.vector.isfinite().all():
+            raise RunError(f"step {global_step}: the networks' parameters are no longer finite")
         is_last = iteration == args.num_iterations
         if args.keep_best_every and (is_last or global_step // args.keep_best_every > before // args.keep_best_every):
             best.consider(args, env.action_space, global_step)
@@ -1947,8 +1963,6 @@ def main(args: Args) -> int:
         progress.update(global_step - progress.n)
         now = time.perf_counter()
         training_seconds, last_time = training_seconds + now - last_time, now
-        if not optimizer.vector.isfinite().all():
-            raise RunError(f"step {global_step}: the networks' parameters are no longer finite")
         if logs:
             metrics = {**means.take(), "charts/noise_size": explorer.size, "charts/noise_distance": distance}
             metrics["charts/selection_return"] = best.last_score
@@ -2014,7 +2028,8 @@ def finish_run(
         "evaluation": {name: value for name, value in evaluation.items() if name not in ("returns", "seeds")},
         "training_seconds": seconds,
         "steps_per_second": global_step / seconds,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }

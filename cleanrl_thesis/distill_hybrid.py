@@ -46,6 +46,7 @@ the points.
 # ]
 # ///
 import contextlib
+import copy
 import csv
 import fcntl
 import functools
@@ -337,10 +338,10 @@ class AppleGameEnv(gym.Env):
     """The Apple game for one player. The end after 30 s is a truncation."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
-    observation_space, action_space = APPLE_OBSERVATIONS, APPLE_ACTIONS
 
     def __init__(self, render_mode: str | None = None):
         self.render_mode = render_mode
+        self.observation_space, self.action_space = copy.deepcopy((APPLE_OBSERVATIONS, APPLE_ACTIONS))
         self.games, self.game = AppleGames(1), np.zeros(1, np.intp)
         self.games.seed(0, self.np_random)
 
@@ -367,16 +368,18 @@ class AppleGameVectorEnv(gym.vector.VectorEnv):
         "render_fps": FPS,
         "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP,
     }
-    single_observation_space, single_action_space = APPLE_OBSERVATIONS, APPLE_ACTIONS
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None):
         self.num_envs, self.render_mode = num_envs, render_mode
+        self.single_observation_space, self.single_action_space = copy.deepcopy((APPLE_OBSERVATIONS, APPLE_ACTIONS))
         self.observation_space = gym.vector.utils.batch_space(APPLE_OBSERVATIONS, num_envs)
         self.action_space = gym.vector.utils.batch_space(APPLE_ACTIONS, num_envs)
         self.games, self.all_games = AppleGames(num_envs), np.arange(num_envs)
         self.seed_games(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_games(self, seeds: list[int]) -> None:
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} games")
         for game, seed in enumerate(seeds):
             self.games.seed(game, gym.utils.seeding.np_random(seed)[0])
 
@@ -1286,6 +1289,15 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
     return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
 
 
+def forget_end(run_dir: Path, goes_on: bool) -> None:
+    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
+    for pattern in ("result.json", *saved):
+        for path in run_dir.glob(pattern):
+            if path.parent.name != "demos_synthetic_human":
+                path.unlink()
+
+
 class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
@@ -1737,7 +1749,7 @@ def main(args: Args) -> int:
     updates_csv = CsvLog(run_dir / "updates.csv", offset)
     if args.track:
         start_wandb(args, run_dir)
-    (run_dir / "result.json").unlink(missing_ok=True)
+    forget_end(run_dir, epoch < last_epoch)
     writer = SummaryWriter(str(run_dir), purge_step=epoch + 1)
     progress = tqdm(total=last_epoch, initial=epoch, unit="epoch", disable=None)
     last_time = time.perf_counter()
@@ -1830,7 +1842,8 @@ def finish_run(
             for mode in modes
         },
         "training_seconds": seconds,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }

@@ -1,7 +1,6 @@
 """DQN on the Apple game: the reinforcement learning teacher of the hybrid agent (thesis section 2.4.1).
 
-    python cleanrl_thesis/dqn_apple.py --save-model --run-dir runs/apple_teacher     # the teacher, for distill_hybrid.py
-    python cleanrl_thesis/dqn_apple.py --compile                                     # the same, faster
+    python cleanrl_thesis/dqn_apple.py --compile --save-model --run-dir runs/apple_teacher    # the teacher, for distill_hybrid.py
     python cleanrl_thesis/dqn_apple.py --env-id CartPole-v1 --total-timesteps 200000
 
 Tasks: the game, which is built in (`gymnasium.make("cleanrl_thesis.dqn_apple:AppleGame-v0")`), and any Gymnasium
@@ -37,6 +36,7 @@ Frames are game frames everywhere in chapter 2: with `--frame-skip 4` the agent 
 # ]
 # ///
 import contextlib
+import copy
 import csv
 import fcntl
 import functools
@@ -316,10 +316,10 @@ class AppleGameEnv(gym.Env):
     """The Apple game for one player. The end after 30 s is a truncation."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
-    observation_space, action_space = APPLE_OBSERVATIONS, APPLE_ACTIONS
 
     def __init__(self, render_mode: str | None = None):
         self.render_mode = render_mode
+        self.observation_space, self.action_space = copy.deepcopy((APPLE_OBSERVATIONS, APPLE_ACTIONS))
         self.games, self.game = AppleGames(1), np.zeros(1, np.intp)
         self.games.seed(0, self.np_random)
 
@@ -346,16 +346,18 @@ class AppleGameVectorEnv(gym.vector.VectorEnv):
         "render_fps": FPS,
         "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP,
     }
-    single_observation_space, single_action_space = APPLE_OBSERVATIONS, APPLE_ACTIONS
 
     def __init__(self, num_envs: int = 1, render_mode: str | None = None):
         self.num_envs, self.render_mode = num_envs, render_mode
+        self.single_observation_space, self.single_action_space = copy.deepcopy((APPLE_OBSERVATIONS, APPLE_ACTIONS))
         self.observation_space = gym.vector.utils.batch_space(APPLE_OBSERVATIONS, num_envs)
         self.action_space = gym.vector.utils.batch_space(APPLE_ACTIONS, num_envs)
         self.games, self.all_games = AppleGames(num_envs), np.arange(num_envs)
         self.seed_games(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_games(self, seeds: list[int]) -> None:
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} games")
         for game, seed in enumerate(seeds):
             self.games.seed(game, gym.utils.seeding.np_random(seed)[0])
 
@@ -608,8 +610,8 @@ class Minibatch(NamedTuple):
     obs: torch.Tensor  # (M, O)
     actions: torch.Tensor  # (M,) int64
     returns: torch.Tensor  # (M,), discounted sum of the n rewards
-    discounts: torch.Tensor  # (M,), γⁿ, or 0 where the episode ended
-    next_obs: torch.Tensor  # (M, O), n steps later
+    discounts: torch.Tensor  # (M,), γⁿ, or 0 where the episode ended; fewer steps than n before a time-out
+    next_obs: torch.Tensor  # (M, O), as many steps later
 
     @classmethod
     def unpack(cls, rows: torch.Tensor) -> "Minibatch":
@@ -884,6 +886,15 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
     return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
 
 
+def forget_end(run_dir: Path, goes_on: bool) -> None:
+    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
+    for pattern in ("result.json", *saved):
+        for path in run_dir.glob(pattern):
+            if path.parent.name != "demos_synthetic_human":
+                path.unlink()
+
+
 class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
@@ -998,15 +1009,12 @@ def check_video(env_id: str) -> None:
         raise UsageError(f"--capture-video: cannot draw {env_id} here: {first_line(error)}") from None
 
 
-def record_video(policy, args: Args, run_dir: Path) -> None:
-    """Play the first evaluation episode once more and write it into `videos/`."""
+def record_video(episode: dict[str, np.ndarray], args: Args, run_dir: Path) -> None:
+    """Play an episode again by its seed and actions and write it into `videos/`."""
     env = gym.wrappers.RecordVideo(make_env(args.env_id, "rgb_array"), str(run_dir / "videos"), lambda episode: True)
-    episode = Episode(env, args.seed, EVALUATION_STREAM, args.frame_skip)
-    obs = episode.start()
-    for _ in range(MAX_EVALUATION_STEPS):
-        obs, _, terminated, truncated = episode.step(int(policy(obs[None])[0]))
-        if terminated or truncated:
-            break
+    env.reset(seed=int(episode["seed"]))
+    for action in episode["actions"].tolist():
+        env.step(action)
     env.close()
 
 
@@ -1014,9 +1022,10 @@ def evaluate(agent: QNetwork, args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes that training never saw; write `evaluation.json` and, if asked, a video."""
     policy = numpy_greedy(agent)
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
-    returns = [float(episode["rewards"].sum()) for episode in play(policy, args.env_id, seeds, args.frame_skip)]
+    episodes = play(policy, args.env_id, seeds, args.frame_skip, keep=args.capture_video)
+    returns = [float(episode["rewards"].sum()) for episode in episodes]
     if args.capture_video:
-        record_video(policy, args, run_dir)
+        record_video(episodes[0], args, run_dir)
     evaluation = {"env_id": args.env_id, "mode": "greedy", **summary(returns), "returns": returns, "seeds": seeds}
     write_json(run_dir / "evaluation.json", evaluation)
     return evaluation
@@ -1206,7 +1215,7 @@ def main(args: Args) -> int:
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
     if args.track:
         start_wandb(args, run_dir)
-    (run_dir / "result.json").unlink(missing_ok=True)
+    forget_end(run_dir, iteration < last_iteration)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * frames_per_step, initial=global_step, unit="frame", disable=None)
     exploration_frames = args.exploration_fraction * args.total_timesteps
@@ -1300,7 +1309,8 @@ def finish_run(agent: QNetwork, args: Args, run_dir: Path, global_step: int, sec
         "evaluation": {name: value for name, value in evaluation.items() if name not in ("returns", "seeds")},
         "training_seconds": seconds,
         "steps_per_second": global_step / seconds,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }

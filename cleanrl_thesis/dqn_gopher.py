@@ -447,8 +447,8 @@ class Minibatch(NamedTuple):
     obs: torch.Tensor  # (M, S, ...) uint8
     actions: torch.Tensor  # (M,) int64
     returns: torch.Tensor  # (M,), discounted sum of the n rewards
-    discounts: torch.Tensor  # (M,), γⁿ, or 0 where the episode ended
-    next_obs: torch.Tensor  # (M, S, ...) uint8, n steps later
+    discounts: torch.Tensor  # (M,), γⁿ, or 0 where the episode ended; fewer steps than n before a time-out
+    next_obs: torch.Tensor  # (M, S, ...) uint8, as many steps later
 
     def to(self, device: torch.device) -> "Minibatch":
         return Minibatch(*(tensor.to(device) for tensor in self))
@@ -773,6 +773,15 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
         return False
     result, wanted = json.loads((run_dir / "result.json").read_text()), arguments(args)
     return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
+
+
+def forget_end(run_dir: Path, goes_on: bool) -> None:
+    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
+    for pattern in ("result.json", *saved):
+        for path in run_dir.glob(pattern):
+            if path.parent.name != "demos_synthetic_human":
+                path.unlink()
 
 
 class CsvLog:
@@ -1108,7 +1117,7 @@ def main(args: Args) -> int:
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
     if args.track:
         start_wandb(args, run_dir)
-    (run_dir / "result.json").unlink(missing_ok=True)
+    forget_end(run_dir, iteration < last_iteration)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * frames_per_step, initial=global_step, unit="frame", disable=None)
     exploration_frames = args.exploration_fraction * args.total_timesteps
@@ -1204,7 +1213,8 @@ def finish_run(
         "evaluation": evaluation,
         "training_seconds": seconds,
         "steps_per_second": global_step / seconds,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }

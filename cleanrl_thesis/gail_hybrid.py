@@ -48,6 +48,7 @@ agent, and its score stands to the DDPG experts' as in Table 2.3. `--demos-human
 # ]
 # ///
 import contextlib
+import copy
 import csv
 import fcntl
 import functools
@@ -687,9 +688,9 @@ class TorcsLikeEnv(gym.Env, TorcsRules):
     """One car. The end after 60 s is a truncation."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
-    observation_space, action_space = TORCS_OBSERVATIONS, TORCS_ACTIONS
 
     def __init__(self, render_mode=None, track="meadow", reward="distance", brake=True, max_laps=None):
+        self.observation_space, self.action_space = copy.deepcopy((TORCS_OBSERVATIONS, TORCS_ACTIONS))
         self.render_mode, self.car = render_mode, np.zeros(1, int)
         self.set_rules(1, track, reward, brake, max_laps)
 
@@ -716,16 +717,18 @@ class TorcsLikeVectorEnv(gym.vector.VectorEnv, TorcsRules):
         "render_fps": FPS,
         "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP,
     }
-    single_observation_space, single_action_space = TORCS_OBSERVATIONS, TORCS_ACTIONS
 
     def __init__(self, num_envs=1, render_mode=None, track="meadow", reward="distance", brake=True, max_laps=None):
         self.num_envs, self.render_mode, self.all_cars = num_envs, render_mode, np.arange(num_envs)
+        self.single_observation_space, self.single_action_space = copy.deepcopy((TORCS_OBSERVATIONS, TORCS_ACTIONS))
         self.observation_space = gym.vector.utils.batch_space(TORCS_OBSERVATIONS, num_envs)
         self.action_space = gym.vector.utils.batch_space(TORCS_ACTIONS, num_envs)
         self.set_rules(num_envs, track, reward, brake, max_laps)
         self.seed_cars(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_cars(self, seeds: list[int]) -> None:
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} cars")
         self.generators = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
 
     def begin(self, cars: np.ndarray) -> None:
@@ -826,7 +829,7 @@ def make_env(env_id: str, render_mode: str | None = None, **options) -> gym.Env:
 
 
 def is_driving(env_id: str) -> bool:
-    return env_id.split(":")[-1] == "TorcsLike-v0"
+    return env_id.split(":")[-1] in ("TorcsLike", "TorcsLike-v0")
 
 
 def env_options(args: Args) -> dict:
@@ -1104,7 +1107,7 @@ class GymPlayers:
             for action in state["actions"][i].numpy():
                 self.obs[i], reward, _, _, _ = env.step(action)
                 self.actions[i].append(action)
-                self.returns[i] += reward
+                self.returns[i] += float(reward)  # as in `step`, whose rewards are float64
         return np.array_equal(self.obs, state["obs"].numpy())
 
 
@@ -1645,6 +1648,15 @@ def learned_from(run_dir: Path, checkpoint: dict | None) -> str | None:
     return json.loads(result.read_text()).get("data") if result.exists() else None
 
 
+def forget_end(run_dir: Path, goes_on: bool) -> None:
+    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
+    for pattern in ("result.json", *saved):
+        for path in run_dir.glob(pattern):
+            if path.parent.name != "demos_synthetic_human":
+                path.unlink()
+
+
 class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
@@ -2043,7 +2055,7 @@ def main(args: Args) -> int:
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
     if args.track:
         start_wandb(args, run_dir)
-    (run_dir / "result.json").unlink(missing_ok=True)
+    forget_end(run_dir, iteration < last_iteration)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * args.batch_size, initial=global_step, unit="step", disable=None)
     last_time = time.perf_counter()
@@ -2143,7 +2155,8 @@ def finish_run(
         },
         "training_seconds": seconds,
         "steps_per_second": global_step / seconds if global_step else None,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }

@@ -133,7 +133,8 @@ class Args:
     chunk_length: int | None = None
     """steps of a chunk; episodes follow each other in it"""
     rewarded_share: float | None = None
-    """share of the chunks that hold a reward, where there is one; all others are drawn from anywhere"""
+    """share of the chunks that hold a reward, where there is one, and above 0 one chunk at least; all others are drawn from
+    anywhere"""
     starts: int | None = None
     """states of a batch at which dreams start, at most"""
     horizon: int = 15
@@ -147,7 +148,7 @@ class Args:
     encoder: Literal["tiles", "cnn"] | None = None
     """a linear map of 2 × 2 pixels each, or convolutions over 64 × 64"""
     frame_side: int | None = None
-    """pixels of the frames' side"""
+    """pixels of the frames' side; default: 64 for a CNN, two for each cell for tiles"""
     depth: int | None = None
     """features of a tile, or channels of the first convolution"""
     deter_z: int | None = None
@@ -236,7 +237,7 @@ class Args:
 
 
 SIZES = {  # features are as many as the baseline's
-    "xs": {"encoder": "tiles", "frame_side": 22, "depth": 16, "deter_z": 128, "stoch_z": 4, "deter_w": 128}
+    "xs": {"encoder": "tiles", "depth": 16, "deter_z": 128, "stoch_z": 4, "deter_w": 128}
     | {"stoch_w": 20, "classes": 16}
     | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
     | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 64, "gamma": 0.95, "image_scale": 0.25}
@@ -244,7 +245,7 @@ SIZES = {  # features are as many as the baseline's
     | {"reward_scale": 10.0, "tanh_reward": False, "prefill": 1_000_000}
     | {"model_learning_rate": 3e-3, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
     | {"adam_eps": 1e-8, "ent_coef": 3e-3},
-    "thesis": {"encoder": "cnn", "frame_side": 64, "depth": 48, "deter_z": 300, "stoch_z": 512, "deter_w": 300}
+    "thesis": {"encoder": "cnn", "depth": 48, "deter_z": 300, "stoch_z": 512, "deter_w": 300}
     | {"stoch_w": 512, "classes": 1, "hidden_size": 600, "head_size": 400, "head_layers": 4, "head_norm": False}
     | {"batch_size": 16, "chunk_length": 50, "rewarded_share": 0.0, "starts": 800, "gamma": 0.999, "image_scale": 1.0}
     | {"kl_z_scale": 0.1, "kl_w_scale": 0.1, "kl_warmup": 0, "entropy_scale": 0.0}
@@ -292,6 +293,10 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
+    if args.encoder is None:
+        args.encoder = SIZES[args.size]["encoder"]
+    if args.frame_side is None:
+        args.frame_side = 64 if args.encoder == "cnn" else 2 * ROOM_SIZES[args.env_id]
     for name, value in SIZES[args.size].items():
         setattr(args, name, value if getattr(args, name) is None else getattr(args, name))
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
@@ -328,6 +333,8 @@ def complete_args(args: Args) -> Args:
         require(args.frame_side == 64, "--frame-side", args.frame_side, "must be 64 with --encoder cnn")
     holds = 8 <= args.frame_side <= 128 and args.frame_side % 2 == 0
     require(holds, "--frame-side", args.frame_side, "must be an even number from 8 to 128")
+    warms = args.entropy_scale == 0 or args.kl_warmup > 0
+    require(warms, "--entropy-scale", args.entropy_scale, "does nothing without --kl-warmup")
     require(not args.resume or args.run_dir is not None, "--resume", "", "needs --run-dir, the folder to go on in")
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")
@@ -566,6 +573,8 @@ class FourRoomsVectorEnv(gym.vector.VectorEnv):
         self.seed_games(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_games(self, seeds: list[int]) -> None:
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} games")
         for game, seed in enumerate(seeds):
             self.games.seed(game, gym.utils.seeding.np_random(seed)[0])
 
@@ -671,7 +680,8 @@ class Replay:
         """Games (B,) and records (B,) where chunks begin: anywhere, or for `--rewarded-share` of them so that they hold a reward."""
         args, places = self.args, self.lengths - self.args.chunk_length + 1
         counts = np.array([len(rows) for rows in self.rewarded])
-        rewarded = round(args.rewarded_share * args.batch_size) if counts.any() else 0
+        least = int(args.rewarded_share > 0)
+        rewarded = max(least, round(args.rewarded_share * args.batch_size)) if counts.any() else 0
         games, begins = draw_from_rows(places, args.batch_size - rewarded)
         if rewarded:
             winners, numbers = draw_from_rows(counts, rewarded)
@@ -1587,6 +1597,15 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
     return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
 
 
+def forget_end(run_dir: Path, goes_on: bool) -> None:
+    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
+    for pattern in ("result.json", *saved):
+        for path in run_dir.glob(pattern):
+            if path.parent.name != "demos_synthetic_human":
+                path.unlink()
+
+
 class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
@@ -1933,7 +1952,7 @@ def main(args: Args) -> int:
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
     if args.track:
         start_wandb(args, run_dir)
-    (run_dir / "result.json").unlink(missing_ok=True)
+    forget_end(run_dir, global_step < last_step)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_step, initial=global_step, unit="step", disable=None)
     last_time = time.perf_counter()
@@ -1992,8 +2011,10 @@ def finish_run(learner: Learner, args: Args, run_dir: Path, global_step: int, se
     for name in ("mean", "std", "min", "max"):
         writer.add_scalar(f"eval/episodic_return_{name}", evaluation[name], global_step)
     if args.save_model:
-        tensors = {f"model.{name}": value for name, value in learner.model.state_dict().items()}
-        tensors |= {f"behaviour.{name}": value for name, value in learner.behaviour.state_dict().items()}
+        parts = {"model": learner.model.state_dict(), "behaviour": learner.behaviour.state_dict()}
+        tensors = {
+            f"{part}.{name}": value.contiguous() for part, state in parts.items() for name, value in state.items()
+        }
         content = safetensors.torch.save(tensors, {"args": json.dumps(arguments(args))})
         write_whole(run_dir / "model.safetensors", content)
     plot_learning_curve(run_dir, args, evaluation)
@@ -2009,7 +2030,8 @@ def finish_run(learner: Learner, args: Args, run_dir: Path, global_step: int, se
         "evaluation": evaluation,
         "training_seconds": seconds,
         "steps_per_second": global_step / seconds,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }

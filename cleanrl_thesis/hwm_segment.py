@@ -1012,6 +1012,15 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
     return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
 
 
+def forget_end(run_dir: Path, goes_on: bool) -> None:
+    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
+    for pattern in ("result.json", *saved):
+        for path in run_dir.glob(pattern):
+            if path.parent.name != "demos_synthetic_human":
+                path.unlink()
+
+
 class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
@@ -1284,7 +1293,7 @@ def main(args: Args) -> int:
     updates_csv = CsvLog(run_dir / "updates.csv", offset)
     if args.track:
         start_wandb(args, run_dir)
-    (run_dir / "result.json").unlink(missing_ok=True)
+    forget_end(run_dir, update < last_update)
     writer = SummaryWriter(str(run_dir), purge_step=update + 1)
     progress = tqdm(total=last_update, initial=update, unit="update", disable=None)
     last_time = time.perf_counter()
@@ -1373,7 +1382,8 @@ def finish_run(
         "finish": {name: arguments(args)[name] for name in FINISH},
         "training_seconds": seconds,
         "updates_per_second": update / seconds,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }

@@ -457,6 +457,8 @@ class FourRoomsVectorEnv(gym.vector.VectorEnv):
         self.seed_games(np.random.SeedSequence().generate_state(num_envs).tolist())
 
     def seed_games(self, seeds: list[int]) -> None:
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} games")
         for game, seed in enumerate(seeds):
             self.games.seed(game, gym.utils.seeding.np_random(seed)[0])
 
@@ -874,6 +876,15 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
     return result["global_step"] >= last_step and result["finish"] == {name: wanted[name] for name in FINISH}
 
 
+def forget_end(run_dir: Path, goes_on: bool) -> None:
+    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
+    for pattern in ("result.json", *saved):
+        for path in run_dir.glob(pattern):
+            if path.parent.name != "demos_synthetic_human":
+                path.unlink()
+
+
 class CsvLog:
     """A CSV file that grows; what was written after the last checkpoint is cut off when a run is resumed."""
 
@@ -1028,7 +1039,7 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
     return {"episodes": len(returns), **numbers}
 
 
-def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
+def save_demonstrations(agent: Agent, args: Args, run_dir: Path, global_step: int) -> None:
     """Write `--save-demos` episodes into `demos/` or `demos_noise_.../`, with the frames of the task, (T + 1, 64, 64, 3) uint8."""
     seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
     pictures = painter(ROOM_SIZES[args.env_id], 64)
@@ -1038,6 +1049,7 @@ def save_demonstrations(agent: Agent, args: Args, run_dir: Path) -> None:
         for episode in play(agent, args, seeds, args.demo_mode, args.demo_noise)
     )
     about = {"env_id": args.env_id, "player": args.exp_name, "mode": args.demo_mode, "noise": args.demo_noise}
+    about |= {"global_step": global_step}
     folder = f"demos_noise_{args.demo_noise:g}" if args.demo_noise else "demos"
     write_demonstrations(run_dir / folder, episodes, about)
 
@@ -1136,6 +1148,9 @@ def main(args: Args) -> int:
     if is_done(run_dir, args, last_iteration * args.batch_size):
         print(f"{run_dir} is done")
         return 0
+    reached = 0 if checkpoint is None else checkpoint["iteration"]
+    is_behind = reached <= last_iteration  # or the demonstrations would be another player's
+    require(is_behind, "--stop-at", args.stop_at, f"{run_dir} is at step {reached * args.batch_size} already")
     done_without = checkpoint is None and (run_dir / "result.json").exists()
     require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
     write_json(run_dir / "args.json", arguments(args))
@@ -1173,7 +1188,7 @@ def main(args: Args) -> int:
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
     if args.track:
         start_wandb(args, run_dir)
-    (run_dir / "result.json").unlink(missing_ok=True)
+    forget_end(run_dir, iteration < last_iteration)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * args.batch_size, initial=global_step, unit="step", disable=None)
     last_time = time.perf_counter()
@@ -1239,7 +1254,7 @@ def finish_run(agent: Agent, args: Args, run_dir: Path, global_step: int, second
         model = safetensors.torch.save(agent.state_dict(), {"args": json.dumps(arguments(args))})
         write_whole(run_dir / "model.safetensors", model)
     if args.save_demos:
-        save_demonstrations(agent, args, run_dir)
+        save_demonstrations(agent, args, run_dir, global_step)
     plot_learning_curve(run_dir, args, evaluation)
     versions = {module.__name__: module.__version__ for module in (gym, minigrid, np, torch)}
     result = {
@@ -1252,7 +1267,8 @@ def finish_run(agent: Agent, args: Args, run_dir: Path, global_step: int, second
         "evaluation": evaluation,
         "training_seconds": seconds,
         "steps_per_second": global_step / seconds,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
         "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
     }

@@ -58,7 +58,6 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("make_update", DQN): "has a target network",
     ("numpy_policy", PPO): "the mean of a Gaussian instead of an action",
     ("play", PPO): "one environment and normalised observations; the discrete methods play many games side by side",
-    ("record_video", DQN): "repeats an action for several frames, and is always greedy",
     ("save_demonstrations", PPO): "plays one environment after the other",
     ("save_demonstrations", DISTILL): "the student's policy, sampled or greedy",
     **{(name, GOPHER): reason for name, reason in ATARI.items()},

@@ -149,6 +149,28 @@ def test_the_size_of_the_noise_goes_to_where_actions_are_as_far_as_asked():
     assert max(noise.size, before) / min(noise.size, before) == pytest.approx(1.01)
 
 
+def test_noise_on_actions_goes_on_through_an_episode(tmp_path, monkeypatch):
+    """`--perturb-interval` is of perturbed actors alone; the noise begins with each episode."""
+    begun, episodes = [], []
+    monkeypatch.setattr(ddpg.ActionNoise, "begin", lambda noise, i: begun.append(i))
+    flags = [
+        "--env-id",
+        "Pendulum-v1",
+        "--noise",
+        "ou",
+        "--total-timesteps",
+        1_500,
+        "--num-envs",
+        5,
+        "--batch-size",
+        16,
+    ]
+    flags += ["--perturb-interval", 10, "--keep-best-every", 0, "--eval-episodes", 1, "--run-dir", tmp_path / "run"]
+    assert ddpg.cli([str(flag) for flag in flags]) == 0
+    episodes = ddpg.read_episodes(tmp_path / "run")
+    assert len(episodes) >= 5 and len(begun) in (len(episodes), len(episodes) + 5)
+
+
 def test_each_environment_has_a_perturbed_actor_of_its_own():
     args, _, optimizer, *_ = make(noise_ladder=False)
     noise = ddpg.ParameterNoise(optimizer, args, ACTIONS, np.random.default_rng(0))
@@ -315,7 +337,7 @@ def test_a_held_policy_acts_anew_every_few_steps():
 
 
 def test_the_best_policy_is_kept(monkeypatch):
-    """Of mean returns 1, 3 and 4, the last with a deviation of 2: the second; with the normalisation that it had."""
+    """Of mean returns 1, 3 and 4, the last with a deviation of 2: the second; with the normalisation and critic that it had."""
     args, _, optimizer, update, _ = make()
     best, space = ddpg.Best(optimizer, update.norm), gym.spaces.Box(-1, 1, (ACTIONS,))
     returns, vectors, scales = iter([(1.0, 1.0), (3.0, 3.0), (2.0, 6.0)]), [], []
@@ -330,9 +352,8 @@ def test_the_best_policy_is_kept(monkeypatch):
     again = ddpg.Best(optimizer, update.norm)
     again.load_state_dict(best.state_dict())
     again.restore()
-    size = optimizer.actor_size
-    assert torch.equal(optimizer.vector[:size], vectors[1][:size]) and torch.equal(update.norm.scale, scales[1])
-    assert not torch.equal(optimizer.vector[size:], vectors[1][size:]) and (again.step, again.score) == (20, 3.0)
+    assert torch.equal(optimizer.vector, vectors[1]) and torch.equal(update.norm.scale, scales[1])
+    assert (again.step, again.score) == (20, 3.0)
     assert best.last_score == 4
     obs = np.ones((2, OBS), np.float32)
     assert np.allclose(update.norm(obs), (obs - scales[1][0].numpy()) / scales[1][1].numpy())

@@ -367,7 +367,7 @@ def test_the_kept_policy_is_evaluated_and_saved(tmp_path, monkeypatch):
     agent = ddpg.Agent(65, 2, 16, True)
     agent.load_state_dict(safetensors.torch.load_file(tmp_path / "run" / "model.safetensors"))
     saved = torch.cat([parameter.detach().reshape(-1) for parameter in agent.actor.parameters()])
-    assert torch.equal(saved, state["best"]["actor"])
+    assert torch.equal(saved, state["best"]["vector"][: len(saved)])
     assert not torch.equal(saved, state["optimizer"]["vector"][: len(saved)])
 
 

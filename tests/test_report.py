@@ -296,11 +296,29 @@ def test_a_setting_without_all_tasks_is_compared_with_none(rows):
     part = [row for row in rows if (row["K"], row["d_target"], row["task"]) != (80, 0.05, "Hopper-v2")]
     part = [row for row in part if row["K"] != 20 or row["seed"] == 1]
     assert report.on_all_tasks(rows, "stop", 80, 0.05) and not report.on_all_tasks(part, "stop", 80, 0.05)
-    lines = {line[0]: line[1:] for line in report.iqm_table(part, "as written")}
+    third = [{**row, "seed": 3} for row in part if row["seed"] == 1 and row["K"] != 20]
+    few, lines = ({line[0]: line[1:] for line in report.iqm_table(each, "as written")} for each in (part, part + third))
     assert lines["KLE-Stop, d_target = 0.05"][4] == "" and "[" in lines["KLE-Stop, d_target = 0.05"][1]
-    assert "[" not in lines["PPO"][2] and float(lines["PPO"][2]) > 0
+    assert "[" not in lines["PPO"][2] and float(lines["PPO"][2]) > 0 and "[" not in few["PPO"][1]
     before, after = (report.heat_map(each, "as written").axes[0].images[0].get_array() for each in (rows, part))
     assert not np.ma.is_masked(before[5, 4]) and np.isnan(np.ma.filled(after, np.nan)[5, 4])
+
+
+def test_each_task_counts_the_same_in_an_interquartile_mean():
+    scores = {"a": np.array([0.0, 0.2, 9.0, 9.0]), "b": np.array([0.4, 0.6])}
+    assert {task: values.tolist() for task, values in report.even(scores).items()} == {"a": [0.0, 0.2], "b": [0.4, 0.6]}
+
+
+def test_a_run_that_has_only_begun_is_left_out(study, tmp_path):
+    """Its CSV files are there, and empty."""
+    shutil.copytree(study, tmp_path / "runs")
+    begun = sorted(path for path in (tmp_path / "runs").iterdir() if (path / "updates.csv").exists())[0]
+    (begun / "result.json").unlink(missing_ok=True)
+    for name in ("updates.csv", "episodes.csv"):
+        (begun / name).write_text("")
+    before, after = (report.read_runs(folder, 102_400, 1) for folder in (study, tmp_path / "runs"))
+    assert len(after) == len(before)
+    assert sum("curves" not in run for run in after) == 1 + sum("curves" not in run for run in before)
 
 
 def test_runs_whose_folders_are_gone_count_on(study, tmp_path):

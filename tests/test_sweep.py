@@ -314,6 +314,32 @@ def test_only_becomes_one_line_of_the_manifest(tmp_path):
     assert "--only 4: the manifest has lines 0 to 3" in err
 
 
+def test_nohup_is_heeded(monkeypatch):
+    """A hangup that is ignored stays so, another one stops the sweep."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        for old, is_heard in ((signal.SIG_IGN, False), (signal.SIG_DFL, True)):
+            signal.signal(signal.SIGHUP, old)
+            signals = sweep.Signals()
+            signals.install()
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert (signals.received == [signal.SIGHUP]) == is_heard
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def test_a_first_run_that_fails_late_stops_no_others(tmp_path):
+    """Its failure ends the sweep only while nothing is done."""
+    runs = [sweep.Run(name, ("false",)) for name in ("first", "second")]
+    args = sweep.Args(command="false", runs=tmp_path, retries=0)
+    (tmp_path / "logs").mkdir()
+    for done, stops in ((0, True), (1, False)):
+        state = sweep.Sweep(done=done, first=runs[0], running={runs[0]: (None, 0.0)})
+        sweep.settle(args, state, runs[0], 1)
+        assert state.failed == {runs[0]: 1} and bool(state.stopped) == stops
+
+
 def test_arrays_are_submitted_in_chunks_of_what_is_not_done(tmp_path, monkeypatch):
     """With stand-ins for squeue and sbatch, which keep what they are given."""
     for name, body in (
@@ -335,6 +361,9 @@ def test_arrays_are_submitted_in_chunks_of_what_is_not_done(tmp_path, monkeypatc
     calls = (tmp_path / "calls").read_text().splitlines()
     assert "--dependency" not in calls[0] and "--dependency=afterany:77" in calls[1]
     (tmp_path / "bin" / "squeue").write_text("#!/bin/sh\necho 77\n")
-    _, err = run([*flags, "--slurm-template-path", ROOT / "benchmark" / "slurm_template.sh"], tmp_path, code=2)
-    assert "still queued" in err
+    for more in ([], ["--grid", "bonus=7"]):
+        _, err = run(
+            [*flags, *more, "--slurm-template-path", ROOT / "benchmark" / "slurm_template.sh"], tmp_path, code=2
+        )
+        assert "still queued" in err
     assert json.loads((tmp_path / "runs" / "more.jsonl").read_text().splitlines()[0])["name"] == "A-v0__bonus=0__seed1"
