@@ -165,9 +165,11 @@ def cell(scores: dict[int, float], most: int) -> str:
 
 def alpha_table(rows: list[dict], mode: str) -> str:
     """Fig. 2.4 in numbers: score for each α and temperature; in brackets the number of seeds where it is not all."""
-    columns = {f"T = {temperature}": alpha_curve(rows, mode, temperature) for temperature in temperatures(rows)}
+    columns = {
+        f"T = {temperature}": alpha_curve(rows, mode, temperature) for temperature in temperatures(rows) or [0.01]
+    }
     alphas = sorted({alpha for curve in columns.values() for alpha in curve})
-    most = max(len(scores) for curve in columns.values() for scores in curve.values())
+    most = max((len(scores) for curve in columns.values() for scores in curve.values()), default=0)
     lines = [f"| α, {ACTS[mode]} | {' | '.join(columns)} |", "|---|" + "---|" * len(columns)]
     for alpha in alphas:
         cells = [cell(curve.get(alpha, {}), most) for curve in columns.values()]
@@ -216,8 +218,12 @@ def kept_table(rows: list[dict]) -> str:
 
 
 def ablation_table(rows: list[dict]) -> str:
-    """The other states and splits beside the main sweep at the same α."""
-    lines = ["| runs | seeds | sampled | greedy | agrees with DQN | with human |", "|---|---|---|---|---|---|"]
+    """The other states and splits beside the main sweep at the same α, and seed by seed less it."""
+    less = " | ".join(f"{ACTS[mode]}, less the main sweep" for mode in ACTS)
+    lines = [
+        f"| runs | seeds | sampled | greedy | agrees with DQN | with human | {less} |",
+        "|" + "---|" * (6 + len(ACTS)),
+    ]
     kinds = {row["kind"] for row in rows if row["mode"] == "sampled"}
     others = sorted(kind for kind in kinds if kind.startswith(("own_", "episode_")))
     for kind in sorted(kinds & {kind.split("_", 1)[1] for kind in others}) + others:
@@ -225,6 +231,11 @@ def ablation_table(rows: list[dict]) -> str:
         columns = [[row["mean"] for row in sampled], [row["mean"] for row in greedy]]
         agreement = [[row[f"test_accuracy_{name}"] for row in sampled] for name in ("rl", "human")]
         cells = [kind, len(sampled), *map(with_interval, columns), *(with_interval(column, 3) for column in agreement)]
+        for mode in ACTS:
+            own, main = (
+                {row["seed"]: row["mean"] for row in select(rows, each, mode)} for each in (kind, kind.split("_")[-1])
+            )
+            cells.append(paired_difference(own, main) if kind in others else "")
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines) + "\n"
 
