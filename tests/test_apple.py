@@ -21,6 +21,22 @@ def action(x: int, y: int) -> int:
 
 
 # The game
+def test_games_have_spaces_of_their_own():
+    """Else what one of them samples changes what another does."""
+    envs = [gym.make("cleanrl_thesis.dqn_apple:AppleGame-v0") for _ in range(2)]
+    for env in envs:
+        env.action_space.seed(1)
+    one, other = ([env.action_space.sample() for _ in range(20)] for env in envs)
+    assert one == other and len(set(one)) > 1
+
+
+def test_a_seed_for_each_game():
+    games = dqn.AppleGameVectorEnv(4)
+    for seeds in ([1, 2], [1, 2, 3, 4, 5]):
+        with pytest.raises(ValueError, match=f"{len(seeds)} seeds for 4 games"):
+            games.reset(seed=seeds)
+
+
 def test_the_single_game_is_an_environment():
     env = gym.make("cleanrl_thesis.dqn_apple:AppleGame-v0", render_mode="rgb_array")
     check_env(env.unwrapped)

@@ -1,6 +1,7 @@
 """DreamerV2: its functions against independent sources, small worlds whose values are known, and small runs."""
 
 import csv
+import importlib
 import json
 import shutil
 import sys
@@ -8,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import safetensors.torch
 import scipy.stats
 import torch
 import torch.nn.functional as F
@@ -486,6 +488,57 @@ def small_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dreamer")
     run(*SMALL, "--run-dir", "run", "--save-model", cwd=folder, script=SCRIPT)
     return folder / "run"
+
+
+@pytest.mark.parametrize("name", ["dreamer_v2", "hwm_dreamer", "hwm_hrl_dreamer"])
+def test_a_model_with_convolutions_is_saved(name, tmp_path):
+    """Their weights lie channels last in memory, which safetensors refuses."""
+    agent = importlib.import_module(f"cleanrl_thesis.{name}")
+    args = agent.complete_args(agent.parse_args(["--size", "m", "--prefill", "1000", "--total-timesteps", "1500"]))
+    model = (agent.WorldModel if name == "dreamer_v2" else agent.HWM)(args, 3)
+    assert not all(value.is_contiguous() for value in model.state_dict().values())
+    flags = ["--encoder", "cnn", "--depth", 1, "--classes", 2, "--batch-size", 1, "--chunk-length", 4, "--horizon", 2]
+    flags += [
+        "--prefill",
+        500,
+        "--total-timesteps",
+        1000,
+        "--train-frequency",
+        500,
+        "--eval-episodes",
+        1,
+        "--save-model",
+    ]
+    run(*flags, "--run-dir", "run", cwd=tmp_path, script=ROOT / "cleanrl_thesis" / f"{name}.py")
+    saved = safetensors.torch.load_file(tmp_path / "run" / "model.safetensors")
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["learner"]["model"]
+    assert all(torch.equal(saved[f"model.{key}"], value) for key, value in state.items())
+
+
+@pytest.mark.parametrize("name", ["dreamer_v2", "hwm_dreamer", "hwm_hrl_dreamer"])
+def test_tiles_show_each_cell_with_two_pixels_in_either_maze(name):
+    agent, sides = importlib.import_module(f"cleanrl_thesis.{name}"), []
+    for flags in (
+        ["--env-id", "FourRooms19-v0"],
+        [],
+        ["--size", "thesis"],
+        ["--env-id", "FourRooms19-v0", "--frame-side", "40"],
+    ):
+        sides.append(agent.complete_args(agent.parse_args(flags)).frame_side)
+    assert sides == [38, 22, 64, 40]
+    pose, goal = agent.maze(19).starts[0].tolist()  # four times the cell, and the direction
+    frames = agent.painter(19, 38).draw(pose // 4 * 4 + np.arange(4), np.full(4, goal))
+    assert min(np.abs(frames[i].astype(int) - frames[j]).max() for i in range(4) for j in range(i)) > 20
+
+
+@pytest.mark.parametrize(("share", "batch", "counts"), [(0, 24, [24]), (0.1, 24, [22, 2]), (0.03, 16, [15, 1])])
+def test_a_share_above_none_is_one_chunk_at_least(share, batch, counts, tmp_path, monkeypatch):
+    collector = make_collector(tmp_path, make_learner(rewarded_share=share, batch_size=batch))
+    collector.replay.rewarded[0] = [20]
+    asked, draw = [], method.draw_from_rows
+    monkeypatch.setattr(method, "draw_from_rows", lambda rows, number: (asked.append(number), draw(rows, number))[1])
+    collector.replay.sample(CPU)
+    assert asked == counts
 
 
 def test_small_run_leaves_its_records(small_run):

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, kill_twice, needs_compiler, run
+from conftest import ROOT, assert_refused, kill_twice, needs_compiler, run
 
 from cleanrl_thesis import ppo_fourrooms as method
 
@@ -171,6 +171,14 @@ def assert_same_states(left, right) -> None:
     for number, moments in states[0]["optimizer"]["state"].items():
         for key, value in moments.items():
             assert torch.equal(value, states[1]["optimizer"]["state"][number][key]), (number, key)
+
+
+def test_demonstrations_of_an_earlier_player_are_refused(small_run, tmp_path, capsys):
+    """The player of step 384 is gone once the run has come further."""
+    shutil.copytree(small_run, tmp_path / "run")
+    flags = [*SMALL, "--stop-at", 384, "--save-demos", 1, "--run-dir", tmp_path / "run", "--resume"]
+    assert_refused(method, capsys, flags, ["--stop-at 384", "is at step"])
+    assert (tmp_path / "run" / "result.json").exists()
 
 
 @pytest.mark.parametrize("torn", [False, True])

@@ -85,6 +85,19 @@ def test_a_finished_run_can_be_evaluated_again(small_run, tmp_path):
     assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
 
 
+def test_a_run_that_goes_on_forgets_what_was_saved_of_the_agent_before(tmp_path):
+    """A model and demonstrations of an early end are no longer there when the agent is another one."""
+    first = run(*SMALL, "--stop-at", 512, "--save-model", "--save-demos", 1, "--run-dir", "run", cwd=tmp_path)
+    folder = tmp_path / "run"
+    saved = [folder / "model.safetensors", folder / "demos" / "manifest.json"]
+    assert first.returncode == 0 and all(path.exists() for path in saved)
+    again = ["--stop-at", 512, "--eval-episodes", 5, "--run-dir", "run", "--resume"]
+    run(*SMALL, *again, cwd=tmp_path)  # the same agent
+    assert all(path.exists() for path in saved)
+    run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
+    assert not any(path.exists() for path in saved) and (folder / "result.json").exists()
+
+
 def test_a_finished_run_without_checkpoints_is_left_alone(small_run, tmp_path):
     shutil.copytree(small_run, tmp_path / "run")
     for name in ("checkpoint.pt", "checkpoint.previous.pt"):

@@ -9,9 +9,21 @@ from gymnasium.utils.env_checker import check_env
 from scipy.integrate import solve_ivp
 
 from cleanrl_thesis import ddpg_torcs_like as torcs
+from cleanrl_thesis import gail_hybrid as gail
 
 ENV_ID = "cleanrl_thesis.ddpg_torcs_like:TorcsLike-v0"
 STRAIGHT = torcs.Track(15, "20000")
+
+
+def test_an_id_without_a_version_is_the_driving_task_too():
+    for method in (torcs, gail):
+        args = method.Args(env_id="TorcsLike", track_name="city")
+        assert method.env_options(args)["track"] == "city"
+
+
+def test_a_seed_for_each_car():
+    with pytest.raises(ValueError, match="2 seeds for 3 cars"):
+        torcs.TorcsLikeVectorEnv(3).reset(seed=[1, 2])
 
 
 def cars_at(track: torcs.Track, distance: float, left: float, speed: float, angle: float = 0.0) -> torcs.Cars:
