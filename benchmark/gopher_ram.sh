@@ -5,7 +5,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/gopher_ram}
-FLAGS="--obs-type ram --n-step 3 --life-loss-ends --anneal-lr --total-timesteps 2000000"
+FLAGS="--obs-type ram --n-step 3 --life-loss-ends --anneal-lr --total-timesteps 2500000"
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
   echo cleanrl_thesis/dqn_gopher.py $FLAGS --seed "$seed" --run-dir "$RUNS/seed$seed"
