@@ -1,7 +1,7 @@
 """DQN on Atari's Gopher: the reinforcement learning teacher of the hybrid agent (thesis section 2.4.2).
 
     python cleanrl_thesis/dqn_gopher.py --bf16 --save-model --run-dir runs/gopher_teacher     # the teacher, for distill_hybrid.py
-    python cleanrl_thesis/dqn_gopher.py --obs-type ram --n-step 3 --life-loss-ends --anneal-lr --total-timesteps 2000000   # minutes
+    python cleanrl_thesis/dqn_gopher.py --obs-type ram --n-step 3 --life-loss-ends --anneal-lr --total-timesteps 2500000   # minutes
     python cleanrl_thesis/dqn_gopher.py --env-id ALE/Breakout-v5
 
 Tasks: every `ALE/*-v5` of ale-py, with the usual preprocessing (frames of 84 × 84 greys, the brighter of two, four of them
