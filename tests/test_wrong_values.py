@@ -112,7 +112,8 @@ BAD_HWM = [
 BAD_DREAMER = [
     (["--env-id", "MiniGrid-FourRooms-v0"], ["--env-id", "MiniGrid-FourRooms-v0", "FourRooms11-v0"]),
     (["--size", "huge"], ["--size", "huge", "thesis"]),
-    (["--encoder", "cnn"], ["--frame-side", "22", "64", "--encoder cnn"]),
+    (["--encoder", "cnn", "--frame-side", 22], ["--frame-side", "22", "64", "--encoder cnn"]),
+    (["--kl-warmup", 0], ["--entropy-scale", "0.3", "--kl-warmup"]),
     (["--frame-side", 21], ["--frame-side", "21", "even"]),
     (["--num-envs", 7], ["--num-envs", "7", "divide 500"]),
     (["--prefill", 750], ["--prefill", "750", "500"]),
@@ -126,7 +127,8 @@ BAD_DREAMER = [
 ]
 BAD_HWM_DREAMER = [
     (["--size", "huge"], ["--size", "huge", "thesis"]),
-    (["--encoder", "cnn"], ["--frame-side", "22", "64", "--encoder cnn"]),
+    (["--encoder", "cnn", "--frame-side", 22], ["--frame-side", "22", "64", "--encoder cnn"]),
+    (["--kl-warmup", 0], ["--entropy-scale", "0.3", "--kl-warmup"]),
     (["--num-envs", 7], ["--num-envs", "7", "divide 500"]),
     (["--stoch-w", 0], ["--stoch-w", "0"]),
     (["--budget", 1.5], ["--budget", "1.5", "between 0 and 1"]),
