@@ -151,7 +151,7 @@ def test_the_size_of_the_noise_goes_to_where_actions_are_as_far_as_asked():
 
 def test_noise_on_actions_goes_on_through_an_episode(tmp_path, monkeypatch):
     """`--perturb-interval` is of perturbed actors alone; the noise begins with each episode."""
-    begun, episodes = [], []
+    begun = []
     monkeypatch.setattr(ddpg.ActionNoise, "begin", lambda noise, i: begun.append(i))
     flags = [
         "--env-id",
