@@ -32,6 +32,7 @@ def main(script: str, size: str, *flags: str) -> None:
     torch.manual_seed(1)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
+    method.keep_freed_memory()
     device = torch.device("cuda" if args.cuda else "cpu")
     model = (method.WorldModel if script == "dreamer_v2" else method.HWM)(args, 3)
     method.set_frame_statistics(model, args)

@@ -1,9 +1,11 @@
 """DreamerV2: its functions against independent sources, small worlds whose values are known, and small runs."""
 
 import csv
+import ctypes
 import importlib
 import json
 import shutil
+import subprocess
 import sys
 from typing import NamedTuple
 
@@ -644,6 +646,30 @@ def test_bfloat16_stays_near_float32(tmp_path):
     wake(learner.behaviour)
     learner.update(data)
     assert all(parameter.grad.abs().sum() > 0 for parameter in learner.behaviour.actor.parameters())
+
+
+FAULTS = """
+import resource
+import torch
+from cleanrl_thesis.dreamer_v2 import keep_freed_memory
+torch.set_num_threads(1)
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(10):
+        torch.zeros(10_000_000)  # 40 MB: more than glibc keeps by itself
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+before = faults()
+keep_freed_memory()
+faults()
+print(before, faults())
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="not glibc")
+def test_freed_memory_is_used_again():
+    done = subprocess.run([sys.executable, "-c", FAULTS], cwd=ROOT, capture_output=True, text=True, check=True)
+    before, after = map(int, done.stdout.split())
+    assert 10 * after < before
 
 
 def test_without_bfloat16_instructions_float32_is_used(monkeypatch):
