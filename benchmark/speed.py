@@ -39,6 +39,8 @@ class Args:
     """how often each contender runs, in turn"""
     update_epochs: tuple[int, ...] = (10, 80)
     """the K of PPO to time, each with a result of its own"""
+    sheeprl: Path | None = None
+    """Python of an environment with sheeprl, a peer of `dreamer`'s size m (benchmark/sheeprl_dreamer.py says how to make one)"""
     out: Path = ROOT / "benchmark" / "results" / "speed"
     """folder for the results"""
 
@@ -66,10 +68,10 @@ def run_process(command: list[str], folder: str) -> tuple[str, float]:
     return out, usage.ru_maxrss / 1024
 
 
-def time_peer(*words: object) -> dict[str, float]:
+def time_peer(*words: object, python: Path | str = sys.executable) -> dict[str, float]:
     """Run a peer's script, which prints its figures as JSON."""
     script, *arguments = map(str, words)
-    out, memory = run_process([sys.executable, str(ROOT / "benchmark" / script), *arguments], str(ROOT))
+    out, memory = run_process([str(python), str(ROOT / "benchmark" / script), *arguments], str(ROOT))
     return {**json.loads(out.splitlines()[-1]), "peak_memory_mb": memory}
 
 
@@ -260,7 +262,7 @@ def time_rooms(args: Args) -> None:
 
 DREAMERS = {  # rows of the result: script, size, the contenders' flags, of which the first is the plain form
     "xs": ("dreamer_v2", "xs", ["", "--bf16", "--compile"]),
-    "m: deter 200, CNN of depth 16, 16 × 50": ("dreamer_v2", "m", ["", "--bf16", "--bf16 --compile"]),
+    "m: deter 200, CNN of depth 16, 16 × 50": ("dreamer_v2", "m", ["", "--compile", "--bf16", "--bf16 --compile"]),
     "xs, HWM Dreamer": ("hwm_dreamer", "xs", ["", "--bf16", "--compile"]),
     "xs, HWM HRL Dreamer": ("hwm_hrl_dreamer", "xs", ["", "--bf16", "--compile"]),
 }
@@ -280,15 +282,21 @@ def dreamer_table(results: list[dict]) -> str:
                 f"{statistics.median(ratios):.2f}",
             ]
             cells.append(f"{min(ratios):.2f} to {max(ratios):.2f}")
-            rounds = row["milliseconds"][name]
-            cells += [f"{statistics.median(each[part] for each in rounds):.1f}" for part in parts]
+            rounds = row["milliseconds"].get(name)  # a peer has none
+            cells += [f"{statistics.median(each[part] for each in rounds):.1f}" if rounds else "" for part in parts]
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def time_dreamer(args: Args) -> None:
-    results = []
+    """Without bfloat16 instructions the forms with `--bf16` are left out: they would be the others once more."""
+    import torch
+
+    if args.sheeprl and not args.sheeprl.is_file():
+        raise SystemExit(f"error: --sheeprl {args.sheeprl}: must be the Python of an environment with sheeprl")
+    has_bf16, results = torch.ops.mkldnn._is_mkldnn_bf16_supported(), []
     for title, (script, size, forms) in DREAMERS.items():
+        forms = [flags for flags in forms if has_bf16 or "--bf16" not in flags]
         parts: dict[str, list] = {}
 
         def contender(flags: str, script=script, size=size, parts=parts) -> dict:
@@ -297,6 +305,8 @@ def time_dreamer(args: Args) -> None:
             return figures
 
         contenders = {flags or "plain": lambda flags=flags, run=contender: run(flags) for flags in forms}
+        if args.sheeprl and size == "m":
+            contenders["sheeprl"] = lambda: time_peer("sheeprl_dreamer.py", python=args.sheeprl)
         results.append({**measure(Work(title, None, 1), contenders, args.rounds), "milliseconds": parts})
     write_results(args, "dreamer", "", results, text=dreamer_table(results))
 

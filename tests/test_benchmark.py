@@ -66,6 +66,20 @@ def test_a_difference_outside_the_interval_is_marked():
     assert table.count("**outside**") == 1 and "**outside**" in table.splitlines()[3]
 
 
+def test_dreamer_table_has_the_parts_of_ours_alone():
+    speeds, ratio = {"plain": [0.25, 0.2], "sheeprl": [0.125, 0.05]}, {"plain": [1.0, 1.0], "sheeprl": [0.5, 0.25]}
+    parts = {"plain": [{"dream": 900.0}, {"dream": 1_000.0}]}
+    row = {"env_id": "m", "steps_per_second": speeds, "ratio": ratio, "milliseconds": parts}
+    lines = speed.dreamer_table([row]).splitlines()
+    assert lines[2] == "| m | plain | 4444 | 1.00 | 1.00 to 1.00 | 950.0 |"
+    assert lines[3] == "| m | sheeprl | 11429 | 3.00 | 2.00 to 4.00 |  |"
+
+
+def test_a_sheeprl_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(SystemExit, match="--sheeprl"):
+        speed.time_dreamer(speed.Args("dreamer", sheeprl=tmp_path / "none"))
+
+
 def test_speed_table_has_medians_and_ratios_round_by_round():
     speeds = {"stable-baselines3": [100.0, 200.0, 150.0], "plain": [400.0, 600.0, 300.0]}
     ratio = {name: [a / b for a, b in zip(values, speeds["stable-baselines3"])] for name, values in speeds.items()}
