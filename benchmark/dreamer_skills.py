@@ -1,0 +1,165 @@
+"""Are skills used where model and segments are perfect? Both levels of HWM HRL Dreamer in the true dynamics of FourRooms11.
+
+    python benchmark/dreamer_skills.py                       # 2 seeds, 4,000 updates each, about half an hour
+    python benchmark/dreamer_skills.py --seeds 1 --updates 600
+
+z is the room (or door) that the agent is in and the goal's cell, w its cell and direction; a segment begins on entering a room or
+door, or every four steps. π^L and V^L see w, z and the skill, as Eq. 3.3.13 has it; or w and the skill alone ("without z"), so that
+whatever is to be known of the goal has to come through the skill. Prints, and writes as `benchmark/results/dreamer/skills.md`, the
+mean return of the greedy policies from all starts of the maze after each sixth of the updates (shortest ways: 0.899), and in the end
+the entropy of π^H and the information of the skill on the action, at all starts. All else is as in `hwm_hrl_dreamer.py --size xs`.
+"""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import tyro
+from common import ROOT, commit
+from dreamer_true import CELLS, LOOKS, Rooms
+
+from cleanrl_thesis import hwm_hrl_dreamer as hrl
+
+PLACES = 8  # four rooms, four doors
+
+
+@dataclass
+class Args:
+    seeds: int = 2
+    """seeds of each setting, from 1 on"""
+    updates: int = 4_000
+    """updates of all actors and critics"""
+    out: Path = ROOT / "benchmark" / "results" / "dreamer"
+    """folder for the table"""
+
+
+class SegmentState(NamedTuple):
+    """The true state, and how many steps ago its segment began."""
+
+    pose: torch.Tensor  # (N,) cell and direction
+    goal: torch.Tensor  # (N,) cell
+    place: torch.Tensor  # (N,) room or door where the segment began
+    age: torch.Tensor  # (N, 1)
+
+    def features(self) -> torch.Tensor:
+        """z, then w: one-hot place, goal, cell and direction, (N, 148); scaled, for a first layer makes little of single ones."""
+        cell, direction = self.pose // 4, self.pose % 4
+        sizes = (self.place, PLACES), (self.goal, CELLS), (cell, CELLS), (direction, 4)
+        return 8 * torch.cat([F.one_hot(*each) for each in sizes], -1).float()
+
+
+class Segments(Rooms):
+    """The true dynamics with segments, in the place of the world model."""
+
+    z_size, feature_size = PLACES + CELLS, PLACES + 2 * CELLS + 4
+
+    def __init__(self, every: int):
+        """every: steps of a segment; 0 for segments that are stays in a room or door."""
+        super().__init__()
+        self.every, self.places = every, torch.from_numpy(hrl.maze(11).rooms)
+
+    def begin(self, pose: torch.Tensor, goal: torch.Tensor) -> SegmentState:
+        return SegmentState(pose, goal, self.places[pose // 4], torch.zeros(len(pose), 1))
+
+    def imagine_step(self, state: SegmentState, action: torch.Tensor, noise: torch.Tensor) -> SegmentState:
+        pose = self.moves[state.pose, action.argmax(-1)]
+        place = self.places[pose // 4]
+        read = (state.age[:, 0] + 1 >= self.every) if self.every else place != state.place
+        age = torch.where(read[:, None], 0.0, state.age + 1)
+        return SegmentState(pose, state.goal, torch.where(read, place, state.place), age)
+
+    def outcome(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        goal, cell = features[..., PLACES : self.z_size], features[..., self.z_size : self.z_size + CELLS]
+        reached = (goal.argmax(-1) == cell.argmax(-1)).float()
+        return reached, 1 - reached
+
+
+def hide_z(behaviour: hrl.Behaviour) -> None:
+    """Have the lower level see zeros in the place of z."""
+
+    def blank(module: torch.nn.Module, inputs: tuple[torch.Tensor]) -> tuple[torch.Tensor]:
+        return (
+            torch.cat([torch.zeros_like(inputs[0][..., : Segments.z_size]), inputs[0][..., Segments.z_size :]], -1),
+        )
+
+    for network in (behaviour.actor, behaviour.critic, behaviour.slow_critic):
+        network.register_forward_pre_hook(blank)
+
+
+def best(logits: torch.Tensor) -> torch.Tensor:
+    return F.one_hot(logits.argmax(-1), logits.shape[-1]).float()
+
+
+@torch.no_grad()
+def true_return(behaviour: hrl.Behaviour, model: Segments) -> float:
+    """Mean return of the greedy policies from all starts."""
+    state = model.begin(*torch.from_numpy(hrl.maze(11).starts.T.copy()))
+    returns, ended, skill = torch.zeros(len(state.pose)), torch.zeros(len(state.pose), dtype=torch.bool), 0.0
+    for step in range(1, hrl.MAX_STEPS + 1):
+        features = state.features()
+        skill = torch.where(state.age == 0, best(behaviour.high_policy(features)), skill)
+        state = model.imagine_step(state, best(behaviour.policy(features, skill)), None)
+        reached = (state.pose // 4 == state.goal) & ~ended
+        returns[reached] = 1 - 0.9 * step / hrl.MAX_STEPS
+        ended |= reached
+    return float(returns.mean())
+
+
+@torch.no_grad()
+def use_of_skills(behaviour: hrl.Behaviour, model: Segments) -> tuple[float, float]:
+    """Entropy of π^H and I(e; a | w, z), both in nats, the means over all starts."""
+    features = model.begin(*torch.from_numpy(hrl.maze(11).starts.T.copy())).features()
+    log_policy = behaviour.high_policy(features).log_softmax(-1)
+    entropy = -(log_policy.exp() * log_policy).sum(-1).mean()
+    return float(entropy), float(hrl.skill_information(behaviour, features))
+
+
+def learn(every: int, sees_z: bool, updates: int, seed: int) -> tuple[list[float], float, float]:
+    """Learn in dreams from anywhere in the maze; the greedy policies' return at each look, and `use_of_skills` in the end."""
+    args = hrl.complete_args(hrl.Args())
+    args.deter_z, args.stoch_z = Segments.z_size, 0
+    torch.manual_seed(seed)
+    model, maze = Segments(every), hrl.maze(11)
+    learner = hrl.Learner(args, model, torch.device("cpu"))
+    if not sees_z:
+        hide_z(learner.behaviour)
+    goals, returns = torch.from_numpy(np.flatnonzero(maze.rooms < 4)), []  # a goal is in a room, not in a door
+    for update in range(1, updates + 1):
+        pose, goal = torch.randint(4 * CELLS, (args.starts,)), goals[torch.randint(len(goals), (args.starts,))]
+        learner.learn_behaviour(model.begin(pose, torch.where(pose // 4 == goal, goals[0], goal)))
+        if update % (updates // LOOKS) == 0:
+            returns.append(true_return(learner.behaviour, model))
+    return returns, *use_of_skills(learner.behaviour, model)
+
+
+def main(args: Args) -> None:
+    if args.updates < LOOKS:
+        raise SystemExit(f"error: --updates {args.updates}: must be at least {LOOKS}")
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    looks = " | ".join(f"{(look + 1) * (args.updates // LOOKS):,}" for look in range(LOOKS))
+    lines = [
+        f"| segments | π^L sees | seed | {looks} | entropy of π^H | I(e; a \\| w, z) | minutes |",
+        "|" + "---|" * (LOOKS + 6),
+    ]
+    print("\n".join(lines))
+    for every, segments in ((0, "rooms and doors"), (4, "4 steps")):
+        for sees_z in (True, False):
+            for seed in range(1, args.seeds + 1):
+                begin = time.perf_counter()
+                returns, entropy, information = learn(every, sees_z, args.updates, seed)
+                cells = [segments, "w, z, e" if sees_z else "w, e", seed, *(f"{value:.3f}" for value in returns)]
+                cells += [f"{entropy:.2f}", f"{information:.3f}", f"{(time.perf_counter() - begin) / 60:.1f}"]
+                lines.append(f"| {' | '.join(map(str, cells))} |")
+                print(lines[-1], flush=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    head = f"`benchmark/dreamer_skills.py` at {commit()}: greedy return after so many updates, one thread; ln 8 = 2.08.\n\n"
+    (args.out / "skills.md").write_text(head + "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
