@@ -1,6 +1,6 @@
 """Are skills used where model and segments are perfect? Both levels of HWM HRL Dreamer in the true dynamics of FourRooms11.
 
-    python benchmark/dreamer_skills.py                       # 2 seeds, 4,000 updates each, about half an hour
+    python benchmark/dreamer_skills.py                       # 2 seeds, 3,600 updates each, about half an hour
     python benchmark/dreamer_skills.py --seeds 1 --updates 600
 
 z is the room (or door) that the agent is in and the goal's cell, w its cell and direction; a segment begins on entering a room or
@@ -31,7 +31,7 @@ PLACES = 8  # four rooms, four doors
 class Args:
     seeds: int = 2
     """seeds of each setting, from 1 on"""
-    updates: int = 4_000
+    updates: int = 3_600
     """updates of all actors and critics"""
     out: Path = ROOT / "benchmark" / "results" / "dreamer"
     """folder for the table"""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,9 @@ from test_dreamer import assert_same_states
 from test_hwm_dreamer import SMALL, TINY, make_data
 
 from cleanrl_thesis import hwm_hrl_dreamer as method
+
+sys.path.append(str(ROOT / "benchmark"))
+import dreamer_skills  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "hwm_hrl_dreamer.py"
 CPU = torch.device("cpu")
@@ -230,6 +234,51 @@ def test_the_player_keeps_its_skill_until_z_is_read(tmp_path):
         skills.append(player.skill)
     for t in range(1, 15):
         assert torch.equal(skills[t], skills[t - 1]) == (t % 5 != 0), t
+
+
+# Skills in the true dynamics
+def walk(every: int, steps: int) -> tuple[list[int], list[int], list[int]]:
+    """A walk straight up through a door: cells' rooms, ages and the places of z, step by step."""
+    maze, model = method.maze(11), dreamer_skills.Segments(every)
+    x, y = method.DOORS[11][1]  # the left door, between the upper and the lower room on the left
+    cell = int(maze.cell_at[x, y + 3])
+    up = next(d for d in range(4) if tuple(method.HEADINGS[d]) == (0, -1))
+    state = model.begin(torch.tensor([4 * cell + up]), torch.tensor([0]))
+    states = [state]
+    for _ in range(steps):
+        state = model.imagine_step(state, F.one_hot(torch.tensor([2]), 3).float(), None)
+        states.append(state)
+    rooms = [int(maze.rooms[int(state.pose) // 4]) for state in states]
+    return rooms, [int(state.age) for state in states], [int(state.place) for state in states]
+
+
+def test_segments_begin_in_rooms_and_doors():
+    rooms, ages, places = walk(0, 5)
+    assert rooms[:3] == [rooms[0]] * 3 and rooms[3] >= 4 and rooms[4] != rooms[0]
+    assert ages == [0, 1, 2, 0, 0, 1] and places == rooms
+
+
+def test_segments_of_four_steps():
+    rooms, ages, places = walk(4, 5)
+    assert ages == [0, 1, 2, 3, 0, 1]
+    assert places == [rooms[0]] * 4 + [rooms[4]] * 2
+
+
+def test_the_lower_level_without_z_knows_of_the_goal_by_its_skill():
+    args = make_args()
+    args.deter_z, args.stoch_z = dreamer_skills.Segments.z_size, 0
+    model = dreamer_skills.Segments(0)
+    behaviour = method.Behaviour(args, model)
+    for parameter in behaviour.parameters():
+        torch.nn.init.normal_(parameter)
+    pose, goals = torch.tensor([8, 8]), torch.tensor([0, 60])
+    features, skill = model.begin(pose, goals).features(), torch.eye(args.num_skills)[[0, 0]]
+    assert not torch.equal(*behaviour.policy(features, skill)) and not torch.equal(*behaviour.value(features, skill))
+    dreamer_skills.hide_z(behaviour)
+    assert torch.equal(*behaviour.policy(features, skill)) and torch.equal(*behaviour.value(features, skill))
+    assert torch.equal(*behaviour.slow_value(features, skill))
+    assert not torch.equal(*behaviour.high_policy(features))
+    assert not torch.equal(*behaviour.policy(features, torch.eye(args.num_skills)[:2]))
 
 
 # Runs
