@@ -7,7 +7,8 @@ z is the room (or door) that the agent is in and the goal's cell, w its cell and
 door, or every four steps. π^L and V^L see w, z and the skill, as Eq. 3.3.13 has it; or w and the skill alone ("without z"), so that
 whatever is to be known of the goal has to come through the skill. Prints, and writes as `benchmark/results/dreamer/skills.md`, the
 mean return of the greedy policies from all starts of the maze after each sixth of the updates (shortest ways: 0.899), and in the end
-the entropy of π^H and the information of the skill on the action, at all starts. All else is as in `hwm_hrl_dreamer.py --size xs`.
+what a skill says of z, I(e; z), and what one that is drawn evenly says of the action, I(e; a | w, z), over all starts. All else is as
+in `hwm_hrl_dreamer.py --size xs`.
 """
 
 import time
@@ -78,16 +79,13 @@ class Segments(Rooms):
         return reached, 1 - reached
 
 
-def hide_z(behaviour: hrl.Behaviour) -> None:
-    """Have the lower level see zeros in the place of z."""
-
-    def blank(module: torch.nn.Module, inputs: tuple[torch.Tensor]) -> tuple[torch.Tensor]:
-        return (
-            torch.cat([torch.zeros_like(inputs[0][..., : Segments.z_size]), inputs[0][..., Segments.z_size :]], -1),
-        )
-
+def prepare(behaviour: hrl.Behaviour, sees_z: bool) -> None:
+    """Scale the skill as the features are, and have the lower level see zeros in the place of z unless `sees_z`."""
+    scale = torch.ones(Segments.feature_size + behaviour.num_skills)
+    scale[Segments.feature_size :] = 8
+    scale[: Segments.z_size] = float(sees_z)
     for network in (behaviour.actor, behaviour.critic, behaviour.slow_critic):
-        network.register_forward_pre_hook(blank)
+        network.register_forward_pre_hook(lambda module, inputs: (inputs[0] * scale,))
 
 
 def best(logits: torch.Tensor) -> torch.Tensor:
@@ -109,13 +107,18 @@ def true_return(behaviour: hrl.Behaviour, model: Segments) -> float:
     return float(returns.mean())
 
 
+def mean_entropy(p: torch.Tensor) -> float:
+    return float(-(p * p.clamp(min=1e-12).log()).sum(-1).mean())
+
+
 @torch.no_grad()
 def use_of_skills(behaviour: hrl.Behaviour, model: Segments) -> tuple[float, float]:
-    """Entropy of π^H and I(e; a | w, z), both in nats, the means over all starts."""
+    """I(e; z), and I(e; a | w, z) of skills that are as likely as each other, in nats, over all starts."""
     features = model.begin(*torch.from_numpy(hrl.maze(11).starts.T.copy())).features()
-    log_policy = behaviour.high_policy(features).log_softmax(-1)
-    entropy = -(log_policy.exp() * log_policy).sum(-1).mean()
-    return float(entropy), float(hrl.skill_information(behaviour, features))
+    chosen = behaviour.high_policy(features).softmax(-1)
+    skills = torch.eye(behaviour.num_skills)
+    acts = torch.stack([behaviour.policy(features, skill.expand(len(features), -1)).softmax(-1) for skill in skills])
+    return mean_entropy(chosen.mean(0)) - mean_entropy(chosen), mean_entropy(acts.mean(0)) - mean_entropy(acts)
 
 
 def learn(every: int, sees_z: bool, updates: int, seed: int) -> tuple[list[float], float, float]:
@@ -125,8 +128,7 @@ def learn(every: int, sees_z: bool, updates: int, seed: int) -> tuple[list[float
     torch.manual_seed(seed)
     model, maze = Segments(every), hrl.maze(11)
     learner = hrl.Learner(args, model, torch.device("cpu"))
-    if not sees_z:
-        hide_z(learner.behaviour)
+    prepare(learner.behaviour, sees_z)
     goals, returns = torch.from_numpy(np.flatnonzero(maze.rooms < 4)), []  # a goal is in a room, not in a door
     for update in range(1, updates + 1):
         pose, goal = torch.randint(4 * CELLS, (args.starts,)), goals[torch.randint(len(goals), (args.starts,))]
@@ -143,7 +145,7 @@ def main(args: Args) -> None:
     torch.set_flush_denormal(True)
     looks = " | ".join(f"{(look + 1) * (args.updates // LOOKS):,}" for look in range(LOOKS))
     lines = [
-        f"| segments | π^L sees | seed | {looks} | entropy of π^H | I(e; a \\| w, z) | minutes |",
+        f"| segments | π^L sees | seed | {looks} | I(e; z) | I(e; a \\| w, z) | minutes |",
         "|" + "---|" * (LOOKS + 6),
     ]
     print("\n".join(lines))
@@ -151,13 +153,13 @@ def main(args: Args) -> None:
         for sees_z in (True, False):
             for seed in range(1, args.seeds + 1):
                 begin = time.perf_counter()
-                returns, entropy, information = learn(every, sees_z, args.updates, seed)
+                returns, of_z, of_action = learn(every, sees_z, args.updates, seed)
                 cells = [segments, "w, z, e" if sees_z else "w, e", seed, *(f"{value:.3f}" for value in returns)]
-                cells += [f"{entropy:.2f}", f"{information:.3f}", f"{(time.perf_counter() - begin) / 60:.1f}"]
+                cells += [f"{of_z:.3f}", f"{of_action:.3f}", f"{(time.perf_counter() - begin) / 60:.1f}"]
                 lines.append(f"| {' | '.join(map(str, cells))} |")
                 print(lines[-1], flush=True)
     args.out.mkdir(parents=True, exist_ok=True)
-    head = f"`benchmark/dreamer_skills.py` at {commit()}: greedy return after so many updates, one thread; ln 8 = 2.08.\n\n"
+    head = f"`benchmark/dreamer_skills.py` at {commit()}: greedy return after so many updates, one thread.\n\n"
     (args.out / "skills.md").write_text(head + "\n".join(lines) + "\n")
 
 

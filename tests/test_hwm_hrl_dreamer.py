@@ -271,14 +271,32 @@ def test_the_lower_level_without_z_knows_of_the_goal_by_its_skill():
     behaviour = method.Behaviour(args, model)
     for parameter in behaviour.parameters():
         torch.nn.init.normal_(parameter)
-    pose, goals = torch.tensor([8, 8]), torch.tensor([0, 60])
-    features, skill = model.begin(pose, goals).features(), torch.eye(args.num_skills)[[0, 0]]
-    assert not torch.equal(*behaviour.policy(features, skill)) and not torch.equal(*behaviour.value(features, skill))
-    dreamer_skills.hide_z(behaviour)
-    assert torch.equal(*behaviour.policy(features, skill)) and torch.equal(*behaviour.value(features, skill))
-    assert torch.equal(*behaviour.slow_value(features, skill))
+    features = model.begin(torch.tensor([8, 8]), torch.tensor([0, 60])).features()  # two goals
+    one, two = torch.eye(args.num_skills)[[0, 0]], torch.eye(args.num_skills)[:2]
+    networks = behaviour.policy, behaviour.value, behaviour.slow_value
+    assert not any(torch.equal(*network(features, one)) for network in networks)
+    dreamer_skills.prepare(behaviour, sees_z=False)
+    assert all(torch.equal(*network(features, one)) for network in networks)
+    assert not any(torch.equal(*network(features, two)) for network in networks)
     assert not torch.equal(*behaviour.high_policy(features))
-    assert not torch.equal(*behaviour.policy(features, torch.eye(args.num_skills)[:2]))
+
+
+def test_use_of_skills():
+    """Skills that tell two classes of goals apart say ln 2 of z; actions that follow them by halves say ln 2 of those."""
+    model = dreamer_skills.Segments(0)
+
+    class ByHalves:
+        num_skills = 4
+
+        def high_policy(self, features):
+            far = features[:, dreamer_skills.PLACES : model.z_size].argmax(-1) % 2
+            return 40 * F.one_hot(far, 4).float()
+
+        def policy(self, features, skill):
+            return 40 * F.one_hot(skill.argmax(-1) // 2, 3).float()
+
+    of_z, of_action = dreamer_skills.use_of_skills(ByHalves(), model)
+    assert of_z == pytest.approx(np.log(2), abs=0.01) and of_action == pytest.approx(np.log(2), abs=1e-3)
 
 
 # Runs
