@@ -41,6 +41,7 @@ WINDOW, LEAST = 200, 50  # episodes of a moving mean, and of its first point
 BINS = 200  # points of a drawn curve
 POINTS = 1_000  # points of a curve that is kept for later reports
 LEVELS = (0.5, 0.85)  # learning, solved
+STAGES = (20_000, 40_000, 60_000)  # steps from the first update on at which the causes are compared
 
 
 @dataclass
@@ -152,13 +153,13 @@ def interval(values: list[float], digits: int) -> str:
     return f"{mean:,.{digits}f} ± {half:,.{digits}f}"
 
 
-def table(rows: list[dict], agents: dict = AGENTS) -> list[str]:
+def table(rows: list[dict]) -> list[str]:
     """One line for each agent; where not every seed has come to a return, how many have."""
     lines = [
         "| agent | seeds | steps to 0.5 | steps to 0.85 | last 200 episodes | greedy | dreamed less real return | minutes |"
     ]
     lines.append("|" + "---|" * 8)
-    for agent, (title, _, _) in agents.items():
+    for agent, (title, _, _) in AGENTS.items():
         group = [row for row in rows if row["agent"] == agent]
         if not group:
             continue
@@ -175,6 +176,30 @@ def table(rows: list[dict], agents: dict = AGENTS) -> list[str]:
         minutes = [row["training_seconds"] / 60 for row in group if row["training_seconds"] != ""]
         cells.append(f"{np.mean(minutes):.0f}" if minutes else "")
         lines.append(f"| {title} | {len(group)} | {' | '.join(cells)} |")
+    return lines
+
+
+def mean_at(run: dict, step: int) -> float:
+    """The moving mean at a step from the first update on; nan where the run has not come so far."""
+    has_come = run["steps"][-1] + 100 >= step  # ten games of 100 steps at most: an episode ends every few steps
+    return float(np.interp(step, run["steps"], run["means"])) if has_come else np.nan
+
+
+def needs_table(runs: list[dict], stages: tuple[int, ...] = STAGES) -> list[str]:
+    """What the baseline comes to without one of the things that it needs, at the same steps; one line for each of them."""
+    heads = [f"return after {stage:,}" for stage in stages]
+    lines = [f"| Dreamer | seeds | steps to 0.5 | {' | '.join(heads)} |", "|" + "---|" * (3 + len(stages))]
+    for agent, (title, _, _) in CAUSES.items():
+        group = [run for run in runs if run["row"]["agent"] == agent]
+        if not group:
+            continue
+        reached = [run["row"]["steps_to_0.5"] for run in group if not np.isnan(run["row"]["steps_to_0.5"])]
+        some = f" ({len(reached)} of {len(group)})" if 0 < len(reached) < len(group) else ""
+        cells = [interval(reached, 0) + some if reached else "not reached"]
+        for stage in stages:
+            values = [mean_at(run, stage) for run in group]
+            cells.append("" if np.isnan(values).any() else interval(values, 3))
+        lines.append(f"| {'as it is' if agent == 'dreamer' else title} | {len(group)} | {' | '.join(cells)} |")
     return lines
 
 
@@ -240,7 +265,7 @@ def write_report(runs: list[dict], out: Path) -> None:
     text += table(rows) + differences(rows)
     curves_figure(runs, AGENTS, "Fig. 3.5").savefig(out / "fig_3_5.png", dpi=110)
     if any(row["agent"] not in AGENTS for row in rows):
-        text += ["", "## What the baseline needs", "", *table(rows, CAUSES)]
+        text += ["", "## What the baseline needs", "", *needs_table(runs)]
         curves_figure(runs, CAUSES, "What the baseline needs").savefig(out / "causes.png", dpi=110)
     (out / "table.md").write_text("\n".join(text) + "\n")
     print("\n".join(text))
