@@ -181,21 +181,25 @@ def table(rows: list[dict]) -> list[str]:
 
 def mean_at(run: dict, step: int) -> float:
     """The moving mean at a step from the first update on; nan where the run has not come so far."""
-    has_come = run["steps"][-1] + 100 >= step  # ten games of 100 steps at most: an episode ends every few steps
+    has_come = run["steps"][-1] + 1_000 >= step  # ten games of 100 steps at most: an episode ends within 1,000
     return float(np.interp(step, run["steps"], run["means"])) if has_come else np.nan
 
 
 def needs_table(runs: list[dict], stages: tuple[int, ...] = STAGES) -> list[str]:
-    """What the baseline comes to without one of the things that it needs, at the same steps; one line for each of them."""
+    """What the baseline comes to without one of the things that it needs, at the same steps; one line for each of them.
+
+    A cell is empty until all of its seeds have come so far.
+    """
     heads = [f"return after {stage:,}" for stage in stages]
-    lines = [f"| Dreamer | seeds | steps to 0.5 | {' | '.join(heads)} |", "|" + "---|" * (3 + len(stages))]
+    lines = [f"| Dreamer | seeds | steps | steps to 0.5 | {' | '.join(heads)} |", "|" + "---|" * (4 + len(stages))]
     for agent, (title, _, _) in CAUSES.items():
         group = [run for run in runs if run["row"]["agent"] == agent]
         if not group:
             continue
         reached = [run["row"]["steps_to_0.5"] for run in group if not np.isnan(run["row"]["steps_to_0.5"])]
         some = f" ({len(reached)} of {len(group)})" if 0 < len(reached) < len(group) else ""
-        cells = [interval(reached, 0) + some if reached else "not reached"]
+        cells = [f"{min(run['row']['steps'] for run in group):,}"]
+        cells.append(interval(reached, 0) + some if reached else "not reached")
         for stage in stages:
             values = [mean_at(run, stage) for run in group]
             cells.append("" if np.isnan(values).any() else interval(values, 3))
@@ -265,7 +269,8 @@ def write_report(runs: list[dict], out: Path) -> None:
     text += table(rows) + differences(rows)
     curves_figure(runs, AGENTS, "Fig. 3.5").savefig(out / "fig_3_5.png", dpi=110)
     if any(row["agent"] not in AGENTS for row in rows):
-        text += ["", "## What the baseline needs", "", *needs_table(runs)]
+        head = f"Steps from the first update on; returns are means of the last {WINDOW} episodes, or of all since the first update."
+        text += ["", "## What the baseline needs", "", head, "", *needs_table(runs)]
         curves_figure(runs, CAUSES, "What the baseline needs").savefig(out / "causes.png", dpi=110)
     (out / "table.md").write_text("\n".join(text) + "\n")
     print("\n".join(text))

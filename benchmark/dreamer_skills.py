@@ -4,11 +4,14 @@
     python benchmark/dreamer_skills.py --seeds 1 --updates 600
 
 z is the room (or door) that the agent is in and the goal's cell, w its cell and direction; a segment begins on entering a room or
-door, or every four steps. π^L and V^L see w, z and the skill, as Eq. 3.3.13 has it; or w and the skill alone ("without z"), so that
-whatever is to be known of the goal has to come through the skill. Prints, and writes as `benchmark/results/dreamer/skills.md`, the
-mean return of the greedy policies from all starts of the maze after each sixth of the updates (shortest ways: 0.899), and in the end
-what a skill says of z, I(e; z), and what one that is drawn evenly says of the action, I(e; a | w, z), over all starts. All else is as
-in `hwm_hrl_dreamer.py --size xs`.
+door, or every four steps, and at each dream's start. π^L and V^L see w, z and the skill, as Eq. 3.3.13 has it; or w and the skill
+alone, so that whatever is to be known of the goal has to come through the skill: eight of them, kept for a whole stay in a room of 16
+cells, cannot say it all, and a greedy policy that sees no goal may circle.
+
+Prints, and writes as `benchmark/results/dreamer/skills.md`, the mean return of the greedy policies from all starts of the maze after
+each sixth of the updates (shortest ways: 0.899), and in the end: that return with skills drawn evenly instead of by π^H; what a skill
+of π^H says of z, I(e; z); and what a skill that is drawn evenly says of the action, I(e; a | w, z), both in nats, over all starts.
+Networks, rates and returns are those of `hwm_hrl_dreamer.py --size xs`, the features and the skill eight times as large.
 """
 
 import time
@@ -93,13 +96,15 @@ def best(logits: torch.Tensor) -> torch.Tensor:
 
 
 @torch.no_grad()
-def true_return(behaviour: hrl.Behaviour, model: Segments) -> float:
-    """Mean return of the greedy policies from all starts."""
+def true_return(behaviour: hrl.Behaviour, model: Segments, draws_skills: bool = False) -> float:
+    """Mean return of the greedy policies from all starts; or of the lower one alone, with skills drawn evenly."""
     state = model.begin(*torch.from_numpy(hrl.maze(11).starts.T.copy()))
     returns, ended, skill = torch.zeros(len(state.pose)), torch.zeros(len(state.pose), dtype=torch.bool), 0.0
     for step in range(1, hrl.MAX_STEPS + 1):
         features = state.features()
-        skill = torch.where(state.age == 0, best(behaviour.high_policy(features)), skill)
+        choices = behaviour.high_policy(features)
+        choices = torch.rand(choices.shape) if draws_skills else choices
+        skill = torch.where(state.age == 0, best(choices), skill)
         state = model.imagine_step(state, best(behaviour.policy(features, skill)), None)
         reached = (state.pose // 4 == state.goal) & ~ended
         returns[reached] = 1 - 0.9 * step / hrl.MAX_STEPS
@@ -113,7 +118,7 @@ def mean_entropy(p: torch.Tensor) -> float:
 
 @torch.no_grad()
 def use_of_skills(behaviour: hrl.Behaviour, model: Segments) -> tuple[float, float]:
-    """I(e; z), and I(e; a | w, z) of skills that are as likely as each other, in nats, over all starts."""
+    """I(e; z) of π^H, and I(e; a | w, z) of skills that are as likely as each other, in nats, over all starts."""
     features = model.begin(*torch.from_numpy(hrl.maze(11).starts.T.copy())).features()
     chosen = behaviour.high_policy(features).softmax(-1)
     skills = torch.eye(behaviour.num_skills)
@@ -121,8 +126,11 @@ def use_of_skills(behaviour: hrl.Behaviour, model: Segments) -> tuple[float, flo
     return mean_entropy(chosen.mean(0)) - mean_entropy(chosen), mean_entropy(acts.mean(0)) - mean_entropy(acts)
 
 
-def learn(every: int, sees_z: bool, updates: int, seed: int) -> tuple[list[float], float, float]:
-    """Learn in dreams from anywhere in the maze; the greedy policies' return at each look, and `use_of_skills` in the end."""
+def learn(every: int, sees_z: bool, updates: int, seed: int) -> tuple[list[float], float, float, float]:
+    """Learn in dreams from anywhere in the maze.
+
+    Returns the greedy policies' return at each look; in the end that with skills drawn evenly, and `use_of_skills`.
+    """
     args = hrl.complete_args(hrl.Args())
     args.deter_z, args.stoch_z = Segments.z_size, 0
     torch.manual_seed(seed)
@@ -135,27 +143,33 @@ def learn(every: int, sees_z: bool, updates: int, seed: int) -> tuple[list[float
         learner.learn_behaviour(model.begin(pose, torch.where(pose // 4 == goal, goals[0], goal)))
         if update % (updates // LOOKS) == 0:
             returns.append(true_return(learner.behaviour, model))
-    return returns, *use_of_skills(learner.behaviour, model)
+    drawn = true_return(learner.behaviour, model, draws_skills=True)
+    return returns, drawn, *use_of_skills(learner.behaviour, model)
 
 
 def main(args: Args) -> None:
-    if args.updates < LOOKS:
-        raise SystemExit(f"error: --updates {args.updates}: must be at least {LOOKS}")
+    if args.updates < LOOKS or args.updates % LOOKS:
+        raise SystemExit(f"error: --updates {args.updates}: must be a multiple of {LOOKS}")
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     looks = " | ".join(f"{(look + 1) * (args.updates // LOOKS):,}" for look in range(LOOKS))
     lines = [
-        f"| segments | π^L sees | seed | {looks} | I(e; z) | I(e; a \\| w, z) | minutes |",
-        "|" + "---|" * (LOOKS + 6),
+        f"| segments | π^L sees | seed | {looks} | any skill | I(e; z) | I(e; a \\| w, z) | minutes |",
+        "|" + "---|" * (LOOKS + 7),
     ]
     print("\n".join(lines))
     for every, segments in ((0, "rooms and doors"), (4, "4 steps")):
         for sees_z in (True, False):
             for seed in range(1, args.seeds + 1):
                 begin = time.perf_counter()
-                returns, of_z, of_action = learn(every, sees_z, args.updates, seed)
+                returns, drawn, of_z, of_action = learn(every, sees_z, args.updates, seed)
                 cells = [segments, "w, z, e" if sees_z else "w, e", seed, *(f"{value:.3f}" for value in returns)]
-                cells += [f"{of_z:.3f}", f"{of_action:.3f}", f"{(time.perf_counter() - begin) / 60:.1f}"]
+                cells += [
+                    f"{drawn:.3f}",
+                    f"{of_z:.3f}",
+                    f"{of_action:.3f}",
+                    f"{(time.perf_counter() - begin) / 60:.1f}",
+                ]
                 lines.append(f"| {' | '.join(map(str, cells))} |")
                 print(lines[-1], flush=True)
     args.out.mkdir(parents=True, exist_ok=True)

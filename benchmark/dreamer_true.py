@@ -101,8 +101,8 @@ def learn(starts: int, horizon: int, updates: int, seed: int) -> list[float]:
 
 
 def main(args: Args) -> None:
-    if args.updates < LOOKS:
-        raise SystemExit(f"error: --updates {args.updates}: must be at least {LOOKS}")
+    if args.updates < LOOKS or args.updates % LOOKS:
+        raise SystemExit(f"error: --updates {args.updates}: must be a multiple of {LOOKS}")
     torch.set_num_threads(1)
     looks = [f"{(look + 1) * (args.updates // LOOKS):,}" for look in range(LOOKS)]
     lines = [f"| dreams | steps | seed | {' | '.join(looks)} | minutes |", "|" + "---|" * (LOOKS + 4)]

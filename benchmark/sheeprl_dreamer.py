@@ -17,14 +17,16 @@ from sheeprl.algos.dreamer_v2.agent import build_agent
 from sheeprl.algos.dreamer_v2.dreamer_v2 import train
 from sheeprl.utils.utils import dotdict
 
-SECONDS, WARM_UP = 8.0, 2  # of gradient steps, and gradient steps before
+SECONDS, WARM_UP = 8.0, 4  # of gradient steps, and gradient steps before
 ACTIONS, SIDE = 3, 64
-SIZES = {  # sheeprl's names for the sizes, and for REINFORCE with a discount head
+SIZES = {  # sheeprl's names for the sizes, the activation and a discount head; REINFORCE is its default
     "algo.per_rank_batch_size": 16,
     "algo.per_rank_sequence_length": 50,
     "algo.horizon": 15,
     "algo.dense_units": 200,
     "algo.mlp_layers": 4,
+    "algo.dense_act": "torch.nn.SiLU",
+    "algo.cnn_act": "torch.nn.SiLU",
     "algo.world_model.encoder.cnn_channels_multiplier": 16,
     "algo.world_model.recurrent_model.recurrent_state_size": 200,
     "algo.world_model.transition_model.hidden_size": 200,
@@ -53,7 +55,10 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     cfg, fabric = make_config(), Fabric(accelerator="cpu", devices=1)
-    torch.distributions.Distribution.set_default_validate_args(cfg.distribution.validate_args)  # as its command does
+    torch.distributions.Distribution.set_default_validate_args(
+        cfg.distribution.validate_args
+    )  # these two as its command
+    torch.set_float32_matmul_precision(cfg.float32_matmul_precision)
     space = gym.spaces.Dict({"rgb": gym.spaces.Box(0, 255, (3, SIDE, SIDE), "uint8")})
     world_model, *others = build_agent(fabric, [ACTIONS], False, cfg, space)
     modules = {"world_model": world_model, "actor": others[0], "critic": others[1]}

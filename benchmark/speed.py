@@ -115,7 +115,7 @@ def gopher_contenders(work: Work) -> dict:
 
 
 def measure(work: Work, contenders: dict, rounds: int) -> dict:
-    """Let the contenders run in turn; return each one's figures, round by round, and its ratios to the first, the peer."""
+    """Let the contenders run in turn; return each one's figures, round by round, and its ratios to the first."""
     figures = {name: [] for name in contenders}
     name_of_work = work.env_id if work.update_epochs is None else f"{work.env_id} K={work.update_epochs}"
     for round_number in range(rounds):
@@ -289,12 +289,16 @@ def dreamer_table(results: list[dict]) -> str:
 
 
 def time_dreamer(args: Args) -> None:
-    """Without bfloat16 instructions the forms with `--bf16` are left out: they would be the others once more."""
+    """The parts of a gradient step, and at size m that of sheeprl where it is at hand.
+
+    Without bfloat16 instructions the forms with `--bf16` are left out: they would be the others once more.
+    """
     import torch
 
     if args.sheeprl and not args.sheeprl.is_file():
         raise SystemExit(f"error: --sheeprl {args.sheeprl}: must be the Python of an environment with sheeprl")
-    has_bf16, results = torch.ops.mkldnn._is_mkldnn_bf16_supported(), []
+    results = []
+    has_bf16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()
     for title, (script, size, forms) in DREAMERS.items():
         forms = [flags for flags in forms if has_bf16 or "--bf16" not in flags]
         parts: dict[str, list] = {}
@@ -306,7 +310,7 @@ def time_dreamer(args: Args) -> None:
 
         contenders = {flags or "plain": lambda flags=flags, run=contender: run(flags) for flags in forms}
         if args.sheeprl and size == "m":
-            contenders["sheeprl"] = lambda: time_peer("sheeprl_dreamer.py", python=args.sheeprl)
+            contenders["sheeprl"] = lambda: time_peer("sheeprl_dreamer.py", python=args.sheeprl.absolute())
         results.append({**measure(Work(title, None, 1), contenders, args.rounds), "milliseconds": parts})
     write_results(args, "dreamer", "", results, text=dreamer_table(results))
 
