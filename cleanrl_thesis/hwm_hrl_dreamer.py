@@ -1446,7 +1446,7 @@ def compile_steps(learner: Learner, data: Chunks) -> bool:
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep what is freed: each large tensor comes from the kernel anew otherwise, a fifth of the time of `--size m`."""
+    """Have glibc keep what is freed: each large tensor comes from the kernel anew otherwise, up to a fifth of a step of `--size m`."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries have none
     if mallopt is not None:
         mallopt(-4, 0)  # M_MMAP_MAX: no block of its own for a large tensor
