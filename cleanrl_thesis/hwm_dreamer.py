@@ -182,7 +182,7 @@ class Args:
     """weight of KL[q(m) ‖ p(m)] (Eq. 3.3.5: 1)"""
     entropy_scale: float | None = None
     """weight of the entropy of categorical codes at first, to none over `--kl-warmup`; without it the goal, which is learned first, takes
-    all codes, sharp ones that learn nothing more, and the agent is never drawn"""
+    all codes, sharp ones that learn little more, and some seeds do not see the agent for hundreds of updates"""
     kl_warmup: int | None = None
     """updates over which the weights of KL_z and KL_w grow from a tenth"""
     kl_balance: float = 0.8
