@@ -4,7 +4,7 @@
     python benchmark/dreamer_skills.py --seeds 1 --updates 600
 
 z is the room (or door) that the agent is in and the goal's cell, w its cell and direction; a segment begins on entering a room or
-door, or every four steps, and at each dream's start. π^L and V^L see w, z and the skill, as Eq. 3.3.13 has it; or w and the skill
+door, or every four steps, and at each dream's start. π^L and V^L see w, z and the skill, as Eq. 3.3.12 has it; or w and the skill
 alone, so that whatever is to be known of the goal has to come through the skill: eight of them, kept for a whole stay in a room of 16
 cells, cannot say it all, and a greedy policy that sees no goal may circle.
 
