@@ -1,12 +1,13 @@
 """Are skills used where model and segments are perfect? Both levels of HWM HRL Dreamer in the true dynamics of FourRooms11.
 
-    python benchmark/dreamer_skills.py                       # 2 seeds, 3,600 updates each, about half an hour
+    python benchmark/dreamer_skills.py                       # 2 seeds, 3,600 updates each, about 40 minutes
+    python benchmark/dreamer_skills.py --sees-z critic       # one of the three settings
     python benchmark/dreamer_skills.py --seeds 1 --updates 600
 
 z is the room (or door) that the agent is in and the goal's cell, w its cell and direction; a segment begins on entering a room or
-door, or every four steps, and at each dream's start. π^L and V^L see w, z and the skill, as Eq. 3.3.12 has it; or w and the skill
-alone, so that whatever is to be known of the goal has to come through the skill: eight of them, kept for a whole stay in a room of 16
-cells, cannot say it all, and a greedy policy that sees no goal may circle.
+door, or every four steps, and at each dream's start. π^L and V^L see w, z and the skill e, as Eq. 3.3.12 has it; or V^L alone does,
+or neither, so that whatever π^L is to know of the goal has to come through the skill: eight of them, kept for a whole stay in a room of
+16 cells, cannot say it all, and a greedy policy that sees no goal may circle.
 
 Prints, and writes as `benchmark/results/dreamer/skills.md`, the mean return of the greedy policies from all starts of the maze after
 each sixth of the updates (shortest ways: 0.899), and in the end: that return with skills drawn evenly instead of by π^H; what a skill
@@ -17,7 +18,7 @@ Networks, rates and returns are those of `hwm_hrl_dreamer.py --size xs`, the fea
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -29,10 +30,13 @@ from dreamer_true import CELLS, LOOKS, Rooms
 from cleanrl_thesis import hwm_hrl_dreamer as hrl
 
 PLACES = 8  # four rooms, four doors
+VIEWS = {"both": "w, z, e | w, z, e", "critic": "w, e | w, z, e", "neither": "w, e | w, e"}  # what π^L and V^L see
 
 
 @dataclass
 class Args:
+    sees_z: tuple[Literal["both", "critic", "neither"], ...] = ("both", "critic", "neither")
+    """which of π^L and V^L see z, each a setting of its own"""
     seeds: int = 2
     """seeds of each setting, from 1 on"""
     updates: int = 3_600
@@ -82,13 +86,15 @@ class Segments(Rooms):
         return reached, 1 - reached
 
 
-def prepare(behaviour: hrl.Behaviour, sees_z: bool) -> None:
-    """Scale the skill as the features are, and have the lower level see zeros in the place of z unless `sees_z`."""
-    scale = torch.ones(Segments.feature_size + behaviour.num_skills)
-    scale[Segments.feature_size :] = 8
-    scale[: Segments.z_size] = float(sees_z)
-    for network in (behaviour.actor, behaviour.critic, behaviour.slow_critic):
-        network.register_forward_pre_hook(lambda module, inputs: (inputs[0] * scale,))
+def prepare(behaviour: hrl.Behaviour, sees_z: str) -> None:
+    """Scale the skill as the features are; whichever of the lower level's networks does not see z has zeros in its place."""
+    actor = torch.ones(Segments.feature_size + behaviour.num_skills)
+    actor[Segments.feature_size :] = 8
+    critic = actor.clone()
+    actor[: Segments.z_size] = float(sees_z == "both")
+    critic[: Segments.z_size] = float(sees_z != "neither")
+    for network, scale in ((behaviour.actor, actor), (behaviour.critic, critic), (behaviour.slow_critic, critic)):
+        network.register_forward_pre_hook(lambda module, inputs, scale=scale: (inputs[0] * scale,))
 
 
 def best(logits: torch.Tensor) -> torch.Tensor:
@@ -126,7 +132,7 @@ def use_of_skills(behaviour: hrl.Behaviour, model: Segments) -> tuple[float, flo
     return mean_entropy(chosen.mean(0)) - mean_entropy(chosen), mean_entropy(acts.mean(0)) - mean_entropy(acts)
 
 
-def learn(every: int, sees_z: bool, updates: int, seed: int) -> tuple[list[float], float, float, float]:
+def learn(every: int, sees_z: str, updates: int, seed: int) -> tuple[list[float], float, float, float]:
     """Learn in dreams from anywhere in the maze.
 
     Returns the greedy policies' return at each look; in the end that with skills drawn evenly, and `use_of_skills`.
@@ -154,16 +160,16 @@ def main(args: Args) -> None:
     torch.set_flush_denormal(True)
     looks = " | ".join(f"{(look + 1) * (args.updates // LOOKS):,}" for look in range(LOOKS))
     lines = [
-        f"| segments | π^L sees | seed | {looks} | any skill | I(e; z) | I(e; a \\| w, z) | minutes |",
-        "|" + "---|" * (LOOKS + 7),
+        f"| segments | π^L sees | V^L sees | seed | {looks} | any skill | I(e; z) | I(e; a \\| w, z) | minutes |",
+        "|" + "---|" * (LOOKS + 8),
     ]
     print("\n".join(lines))
     for every, segments in ((0, "rooms and doors"), (4, "4 steps")):
-        for sees_z in (True, False):
+        for sees_z in args.sees_z:
             for seed in range(1, args.seeds + 1):
                 begin = time.perf_counter()
                 returns, drawn, of_z, of_action = learn(every, sees_z, args.updates, seed)
-                cells = [segments, "w, z, e" if sees_z else "w, e", seed, *(f"{value:.3f}" for value in returns)]
+                cells = [segments, VIEWS[sees_z], seed, *(f"{value:.3f}" for value in returns)]
                 cells += [
                     f"{drawn:.3f}",
                     f"{of_z:.3f}",

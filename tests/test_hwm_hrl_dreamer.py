@@ -264,7 +264,10 @@ def test_segments_of_four_steps():
     assert places == [rooms[0]] * 4 + [rooms[4]] * 2
 
 
-def test_the_lower_level_without_z_knows_of_the_goal_by_its_skill():
+@pytest.mark.parametrize(
+    "sees_z, hidden", [("both", [False] * 3), ("critic", [True, False, False]), ("neither", [True] * 3)]
+)
+def test_who_does_not_see_z_knows_of_the_goal_by_the_skill(sees_z, hidden):
     args = make_args()
     args.deter_z, args.stoch_z = dreamer_skills.Segments.z_size, 0
     model = dreamer_skills.Segments(0)
@@ -275,8 +278,8 @@ def test_the_lower_level_without_z_knows_of_the_goal_by_its_skill():
     one, two = torch.eye(args.num_skills)[[0, 0]], torch.eye(args.num_skills)[:2]
     networks = behaviour.policy, behaviour.value, behaviour.slow_value
     assert not any(torch.equal(*network(features, one)) for network in networks)
-    dreamer_skills.prepare(behaviour, sees_z=False)
-    assert all(torch.equal(*network(features, one)) for network in networks)
+    dreamer_skills.prepare(behaviour, sees_z=sees_z)
+    assert [torch.equal(*network(features, one)) for network in networks] == hidden
     assert not any(torch.equal(*network(features, two)) for network in networks)
     assert not torch.equal(*behaviour.high_policy(features))
 
