@@ -243,7 +243,9 @@ def curves_figure(runs: list[dict], agents: dict, title: str) -> Figure:
     for level in LEVELS:
         axes.axhline(level, color="black", linestyle=":", linewidth=0.8)
     row = runs[0]["row"]
-    axes.set_title(f"{title}: {row['env_id']}, size {row['size']}; mean of {WINDOW} episodes, range over seeds")
+    axes.set_title(
+        f"{title}: {row['env_id']}, size {row['size']}; mean of {WINDOW} episodes, range over seeds", fontsize="medium"
+    )
     axes.set(xlabel="environment steps from the first update on", ylabel="episodic return", ylim=(0, 1))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.spines[["top", "right"]].set_visible(False)
