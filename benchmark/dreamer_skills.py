@@ -25,7 +25,7 @@ import torch
 import torch.nn.functional as F
 import tyro
 from common import ROOT, commit
-from dreamer_true import CELLS, LOOKS, Rooms
+from dreamer_true import CELLS, LOOKS, Rooms, check_updates
 
 from cleanrl_thesis import hwm_hrl_dreamer as hrl
 
@@ -154,8 +154,7 @@ def learn(every: int, sees_z: str, updates: int, seed: int) -> tuple[list[float]
 
 
 def main(args: Args) -> None:
-    if args.updates < LOOKS or args.updates % LOOKS:
-        raise SystemExit(f"error: --updates {args.updates}: must be a multiple of {LOOKS}")
+    check_updates(args.updates)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     looks = " | ".join(f"{(look + 1) * (args.updates // LOOKS):,}" for look in range(LOOKS))

@@ -100,9 +100,14 @@ def learn(starts: int, horizon: int, updates: int, seed: int) -> list[float]:
     return returns
 
 
+def check_updates(updates: int) -> None:
+    """Raises SystemExit where the looks would not part them evenly."""
+    if updates < LOOKS or updates % LOOKS:
+        raise SystemExit(f"error: --updates {updates}: must be a multiple of {LOOKS}")
+
+
 def main(args: Args) -> None:
-    if args.updates < LOOKS or args.updates % LOOKS:
-        raise SystemExit(f"error: --updates {args.updates}: must be a multiple of {LOOKS}")
+    check_updates(args.updates)
     torch.set_num_threads(1)
     looks = [f"{(look + 1) * (args.updates // LOOKS):,}" for look in range(LOOKS)]
     lines = [f"| dreams | steps | seed | {' | '.join(looks)} | minutes |", "|" + "---|" * (LOOKS + 4)]
