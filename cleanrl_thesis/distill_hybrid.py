@@ -1007,12 +1007,23 @@ class Student(nn.Module):
             [nn.Linear(features, hidden_size), nn.Linear(hidden_size, hidden_size), nn.Linear(hidden_size, num_actions)]
         )
 
+    def features(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (M, O) -> the same; images (M, C, H, W) of 0 to 255 -> (M, F)."""
+        if self.convolutions is None:
+            return obs.float()
+        first, *others = self.convolutions
+        x = obs.to(torch.bfloat16 if self.bf16 else torch.float32)  # exact: bfloat16 has all integers up to 256
+        x = x.contiguous(memory_format=torch.channels_last)  # faster; and 255 divides the weights, which are fewer
+        x = F.conv2d(x, first.weight / 255, first.bias, first.stride)
+        for layer in others:
+            x = layer(x)
+        return x
+
     def forward(self, obs: torch.Tensor, masks: torch.Tensor | None = None) -> torch.Tensor:
         """Observations (M, O), or (M, C, H, W) uint8 -> logits (M, A); `masks` (2, M, H) multiply the hidden units."""
         first, second, output = self.layers
         with torch.autocast(obs.device.type, torch.bfloat16, enabled=self.bf16):
-            features = obs.float() if self.convolutions is None else self.convolutions(obs / 255)
-            hidden = torch.relu(first(features))
+            hidden = torch.relu(first(self.features(obs)))
         hidden = hidden.float()
         hidden = torch.relu(second(hidden if masks is None else hidden * masks[0]))
         return output(hidden if masks is None else hidden * masks[1])

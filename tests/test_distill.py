@@ -163,6 +163,15 @@ class Quadrants(gym.Env):
         return self.draw(), reward, False, self.steps == 20, {}
 
 
+def test_a_student_sees_bytes_as_shares_of_255():
+    """Channels last and with 255 in the weights, the convolutions give what the layers in their order give."""
+    student = distill.Student((4, 84, 84), 8, 256)
+    images = torch.randint(0, 256, (5, 4, 84, 84), dtype=torch.uint8)
+    features = student.features(images)
+    assert torch.allclose(features, student.convolutions(images / 255), atol=1e-6)
+    assert features.abs().max() > 0.01
+
+
 @pytest.mark.parametrize("flags", [[], ["--compile", "--split", "episode"]])
 def test_a_student_of_images_learns_from_recordings(tmp_path, monkeypatch, flags):
     """The convolutional student, from demonstrations of a player who looks at the brightest quarter."""
