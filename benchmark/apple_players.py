@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
-from common import ROOT, commit, published_table, write_csv
+from common import ROOT, commit, published_table, run_main, write_csv
 
 PLAYERS = {"shortest path": "DQN", "synthetic human": "human"}  # and the row of Table 2.1 that each is to be like
 
@@ -134,4 +133,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_main(main, Args, __doc__)

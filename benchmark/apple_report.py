@@ -19,9 +19,8 @@ import safetensors.torch
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-import tyro
 from apple_players import QUICK, load_method, shortest_path
-from common import ROOT, commit, commit_of, finished_runs, published_table, write_csv
+from common import ROOT, UsageError, commit, commit_of, finished_runs, published_table, run_main, write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -425,7 +424,7 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     rows = read_runs(args.runs)
     if not rows:
-        raise SystemExit(f"--runs {args.runs}: holds no finished run")
+        raise UsageError(f"--runs {args.runs}: holds no finished run")
     method = load_method("distill_hybrid")
     seeds = sorted({row["seed"] for row in rows})
     quick_human = type("QuickHuman", (method.SyntheticHuman,), QUICK)
@@ -456,4 +455,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_main(main, Args, __doc__)

@@ -1,13 +1,30 @@
-"""What the reports share: published tables, results as CSV, and the commits that results rest on."""
+"""What the benchmarks share: how they start, published tables, results as CSV, and the commits that results rest on."""
 
 import csv
 import hashlib
 import json
 import subprocess
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import tyro
+
 ROOT = Path(__file__).resolve().parent.parent
+
+
+class UsageError(Exception):
+    """A wrong value, told in one line; the exit code is 2."""
+
+
+def run_main(main: Callable, arguments: type, doc: str) -> None:
+    """Run `main` with what the command line says; a wrong value is one line and exit code 2."""
+    args = tyro.cli(arguments, description=doc.split("\n\n")[0])
+    try:
+        main(args)
+    except UsageError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
 
 
 def published_rows(name: str) -> list[dict[str, str]]:

@@ -8,13 +8,13 @@ the goal's cell: cells, episodes, share of the goals reached, and mean return. A
 
 import importlib
 import json
-import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
+from common import UsageError, run_main
 
 GROUPS = {"0": (0, 0), "1 to 2": (1, 2), "3 to 9": (3, 9), "10 and more": (10, 10**9)}  # rewards at a goal's cell
 
@@ -28,10 +28,10 @@ class Args:
 
 
 def load(run: Path) -> tuple:
-    """Script, arguments, agent and replay of a run. Raises SystemExit where there is no checkpoint."""
+    """Script, arguments, agent and replay of a run. Raises UsageError where there is no checkpoint."""
     saved = torch.load(run / "checkpoint.pt", weights_only=True) if (run / "checkpoint.pt").exists() else None
     if saved is None:
-        raise SystemExit(f"error: {run}: holds no checkpoint of a Dreamer")
+        raise UsageError(f"{run}: holds no checkpoint of a Dreamer")
     arguments = json.loads((run / "args.json").read_text())
     method = importlib.import_module(f"cleanrl_thesis.{arguments['exp_name']}")
     names = {field.name for field in fields(method.Args)} - {"run_dir", "resume"}
@@ -70,4 +70,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Args, description=__doc__.split("\n\n")[0])))
+    run_main(main, Args, __doc__)

@@ -7,13 +7,13 @@ step, how many there are and the share of them at which z is read. `age` tells a
 the steps since the last one.
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
+from common import UsageError, run_main
 from dreamer_goals import load
 
 AGES = 8
@@ -73,7 +73,7 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     method, its, learner, _ = load(args.run)
     if not hasattr(method, "HWM"):
-        raise SystemExit(f"error: {args.run}: a run of {its.exp_name}, whose model has no segments")
+        raise UsageError(f"{args.run}: a run of {its.exp_name}, whose model has no segments")
     seeds = [method.episode_seed(its.seed, method.EVALUATION_STREAM, i) for i in range(args.episodes)]
     with method.own_randomness(its.seed):
         played = play(method, learner, its, seeds)
@@ -94,4 +94,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Args, description=__doc__.split("\n\n")[0])))
+    run_main(main, Args, __doc__)

@@ -3,7 +3,7 @@
     python benchmark/dreamer_report.py                              # runs/dreamer_xs -> benchmark/results/dreamer/xs
     python benchmark/dreamer_report.py --known DIR                  # with the runs of an earlier report whose folders are gone
 
-Takes whatever part of the runs there is, as far as the shortest of them has come. Steps are counted from the first update, after
+Runs that go on are in the figures, as far as the shortest of an agent's has come, and not yet in its table. Steps are counted from the first update, after
 the random play of `--prefill`, whose episodes are in no mean. A run has come to a return when the mean of its last 200 episodes is
 as high; near 0.5 these span some 10,000 steps. Intervals are 95% t-intervals over seeds.
 """
@@ -11,13 +11,13 @@ as high; near 0.5 these span some 10,000 steps. Intervals are 95% t-intervals ov
 import csv
 import json
 import re
+import zipfile
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
-from common import ROOT, commit, commit_of, write_csv
+from common import ROOT, UsageError, commit, commit_of, run_main, write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -39,7 +39,7 @@ CAUSES = {  # the baseline, and what it does without one of the things that it n
 }
 WINDOW, LEAST = 200, 50  # episodes of a moving mean, and of its first point
 BINS = 200  # points of a drawn curve
-POINTS = 1_000  # points of a curve that is kept for later reports
+POINTS = 1_000  # points of a curve, as it is drawn, compared and kept for later reports
 LEVELS = (0.5, 0.85)  # learning, solved
 STAGES = (20_000, 40_000, 60_000)  # steps from the first update on at which the causes are compared
 
@@ -81,7 +81,10 @@ def has_curve(folder: Path) -> bool:
 
 
 def read_run(folder: Path) -> dict:
-    """A run's row, and its moving mean over the steps with updates. The comparison's columns stand where the run has made one."""
+    """A run's row, and POINTS of its moving mean over the steps with updates.
+
+    The comparison's columns stand where the run has made one, those of the end where it has ended.
+    """
     args = json.loads((folder / "args.json").read_text())
     steps, returns = learned_episodes(folder, args["prefill"])
     means = moving_mean(returns)
@@ -96,7 +99,8 @@ def read_run(folder: Path) -> dict:
     ended = json.loads(result.read_text()) if result.exists() else {}
     row |= {name: ended.get(name, "") for name in ("training_seconds", "script_sha256")}
     row["greedy"] = ended["evaluation"]["mean"] if ended else np.nan
-    return {"row": row, "steps": steps[LEAST - 1 :], "means": means[LEAST - 1 :]}
+    at = np.unique(np.linspace(LEAST - 1, len(steps) - 1, POINTS).astype(int))
+    return {"row": row, "steps": steps[at].astype(np.float32), "means": means[at].astype(np.float32)}
 
 
 def cell(text: str) -> float | int | str:
@@ -110,16 +114,16 @@ def cell(text: str) -> float | int | str:
 
 
 def read_known(folder: Path) -> list[dict]:
-    """The runs of an earlier report as `read_runs` gives them. Raises SystemExit where it cannot be read."""
+    """The runs of an earlier report as `read_runs` gives them. Raises UsageError where it cannot be read."""
     try:
         with open(folder / "runs.csv", newline="") as file:
             rows = list(csv.DictReader(file))
         curves = np.load(folder / "curves.npz")
-    except OSError as error:
-        raise SystemExit(f"error: --known {folder}: cannot be read: {error.strerror}") from None
-    words = {"agent", "size", "env_id", "script_sha256"}
-    rows = [{key: text if key in words else cell(text) for key, text in row.items()} for row in rows]
-    return [{"row": row, **dict(zip(("steps", "means"), curves[run_name(row)].astype(float)))} for row in rows]
+        words = {"agent", "size", "env_id", "script_sha256"}
+        rows = [{key: text if key in words else cell(text) for key, text in row.items()} for row in rows]
+        return [{"row": row, **dict(zip(("steps", "means"), curves[run_name(row)]))} for row in rows]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise UsageError(f"--known {folder}: cannot be read: {error}") from None
 
 
 def run_name(row: dict) -> str:
@@ -129,7 +133,7 @@ def run_name(row: dict) -> str:
 def read_runs(folder: Path, known: list[dict] = ()) -> list[dict]:
     """All runs of known agents that have a curve, and those runs of an earlier report that are not among them.
 
-    Raises SystemExit where their sizes or tasks differ.
+    Raises UsageError where their sizes or tasks differ.
     """
     paths = sorted(path.parent for path in folder.glob("*/updates.csv") if path.stat().st_size)
     paths = [path for path in paths if re.sub(r"_seed\d+$", "", path.name) in AGENTS | CAUSES]
@@ -140,7 +144,7 @@ def read_runs(folder: Path, known: list[dict] = ()) -> list[dict]:
     )
     kinds = {(run["row"]["size"], run["row"]["env_id"]) for run in runs}
     if len(kinds) != 1:
-        raise SystemExit(f"error: --runs {folder}: " + ("holds runs of several kinds" if kinds else "holds no run"))
+        raise UsageError(f"--runs {folder}: " + ("holds runs of several kinds" if kinds else "holds no run"))
     return runs
 
 
@@ -153,28 +157,27 @@ def interval(values: list[float], digits: int) -> str:
     return f"{mean:,.{digits}f} ± {half:,.{digits}f}"
 
 
+def has_ended(row: dict) -> bool:
+    return not np.isnan(row["greedy"])
+
+
 def table(rows: list[dict]) -> list[str]:
-    """One line for each agent; where not every seed has come to a return, how many have."""
-    lines = [
-        "| agent | seeds | steps to 0.5 | steps to 0.85 | last 200 episodes | greedy | dreamed less real return | minutes |"
-    ]
-    lines.append("|" + "---|" * 8)
+    """One line for each agent, of its runs that have ended; where not every seed has come to a return, how many have."""
+    heads = ["steps", *(f"steps to {level}" for level in LEVELS), "last 200 episodes", "greedy"]
+    lines = [f"| agent | seeds | {' | '.join(heads)} | dreamed less real return | minutes |", "|" + "---|" * 9]
     for agent, (title, _, _) in AGENTS.items():
-        group = [row for row in rows if row["agent"] == agent]
+        group = [row for row in rows if row["agent"] == agent and has_ended(row)]
         if not group:
             continue
-        cells = []
+        cells = [f"{min(row['steps'] for row in group):,}"]
         for level in LEVELS:
             known = [row[f"steps_to_{level}"] for row in group if not np.isnan(row[f"steps_to_{level}"])]
             some = f" ({len(known)} of {len(group)})" if 0 < len(known) < len(group) else ""
             cells.append(interval(known, 0) + some if known else "not reached")
-        cells.append(interval([row["last_200"] for row in group], 3))
-        greedy = [row["greedy"] for row in group if not np.isnan(row["greedy"])]
-        cells.append(interval(greedy, 3) if greedy else "")
+        cells += [interval([row[name] for row in group], 3) for name in ("last_200", "greedy")]
         gaps = [row["dreamed_return"] - row["real_return"] for row in group if not np.isnan(row["dreamed_return"])]
         cells.append(interval(gaps, 3) if gaps else "")
-        minutes = [row["training_seconds"] / 60 for row in group if row["training_seconds"] != ""]
-        cells.append(f"{np.mean(minutes):.0f}" if minutes else "")
+        cells.append(f"{np.mean([row['training_seconds'] / 60 for row in group]):.0f}")
         lines.append(f"| {title} | {len(group)} | {' | '.join(cells)} |")
     return lines
 
@@ -213,7 +216,9 @@ def differences(rows: list[dict]) -> list[str]:
     for later, earlier in (("hwm", "dreamer"), ("hrl", "hwm"), ("hwm_fixed", "hwm"), ("hrl_fixed", "hrl")):
         cells = []
         for name, digits in (("steps_to_0.5", 0), ("last_200", 3), ("greedy", 3)):
-            groups = [[row[name] for row in rows if row["agent"] == agent] for agent in (later, earlier)]
+            groups = [
+                [row[name] for row in rows if row["agent"] == agent and has_ended(row)] for agent in (later, earlier)
+            ]
             if min(map(len, groups)) > 1 and not np.isnan(groups[0] + groups[1]).any():
                 low, high = stats.ttest_ind(*groups, equal_var=False).confidence_interval()
                 cells.append(
@@ -258,10 +263,7 @@ def write_report(runs: list[dict], out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     rows = [run["row"] for run in runs]
     write_csv(out / "runs.csv", rows)
-    curves = {}
-    for run in runs:
-        at = np.unique(np.linspace(0, len(run["steps"]) - 1, POINTS).astype(int))
-        curves[run_name(run["row"])] = np.array([run["steps"][at], run["means"][at]], np.float32)
+    curves = {run_name(run["row"]): np.array([run["steps"], run["means"]]) for run in runs}
     np.savez_compressed(out / "curves.npz", **curves)
     scripts = {((AGENTS | CAUSES)[row["agent"]][1], row["script_sha256"]) for row in rows if row["script_sha256"]}
     made_at = ", ".join(f"{name}.py at {commit_of(name, digest)}" for name, digest in sorted(scripts))
@@ -269,6 +271,9 @@ def write_report(runs: list[dict], out: Path) -> None:
     about = f"{made_at or 'runs that go on'}; this report at {commit()}. One thread each. Steps from the first update on, after {play}"
     text = [f"`benchmark/fourrooms.sh`, {about} of random play.", ""]
     text += table(rows) + differences(rows)
+    going_on = [f"{run_name(row)} ({row['steps']:,} steps)" for row in rows if not has_ended(row)]
+    if going_on:
+        text += ["", f"In the figures only, for they go on: {', '.join(going_on)}."]
     curves_figure(runs, AGENTS, "Fig. 3.5").savefig(out / "fig_3_5.png", dpi=110)
     if any(row["agent"] not in AGENTS for row in rows):
         head = f"Steps from the first update on; returns are means of the last {WINDOW} episodes, or of all since the first update."
@@ -278,8 +283,11 @@ def write_report(runs: list[dict], out: Path) -> None:
     print("\n".join(text))
 
 
-if __name__ == "__main__":
-    arguments = tyro.cli(Args, description=__doc__.split("\n\n")[0])
-    found = read_runs(arguments.runs, read_known(arguments.known) if arguments.known is not None else [])
+def main(args: Args) -> None:
+    found = read_runs(args.runs, read_known(args.known) if args.known is not None else [])
     size = found[0]["row"]["size"]
-    write_report(found, arguments.out or ROOT / "benchmark" / "results" / "dreamer" / size)
+    write_report(found, args.out or ROOT / "benchmark" / "results" / "dreamer" / size)
+
+
+if __name__ == "__main__":
+    run_main(main, Args, __doc__)

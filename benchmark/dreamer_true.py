@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-import tyro
-from common import ROOT, commit
+from common import ROOT, UsageError, commit, run_main
 
 from cleanrl_thesis import dreamer_v2
 
@@ -101,9 +100,9 @@ def learn(starts: int, horizon: int, updates: int, seed: int) -> list[float]:
 
 
 def check_updates(updates: int) -> None:
-    """Raises SystemExit where the looks would not part them evenly."""
+    """Raises UsageError where the looks would not part them evenly."""
     if updates < LOOKS or updates % LOOKS:
-        raise SystemExit(f"error: --updates {updates}: must be a multiple of {LOOKS}")
+        raise UsageError(f"--updates {updates}: must be a multiple of {LOOKS}")
 
 
 def main(args: Args) -> None:
@@ -126,4 +125,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
+    run_main(main, Args, __doc__)

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
-from common import ROOT, commit
+from common import ROOT, commit, run_main
 
 sys.path.insert(0, str(ROOT))
 from cleanrl_thesis import ppo_fourrooms as rooms  # noqa: E402
@@ -124,4 +123,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
+    run_main(main, Args, __doc__)

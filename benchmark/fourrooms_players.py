@@ -12,8 +12,7 @@ python benchmark/fourrooms_players.py        # runs/fourrooms -> benchmark/resul
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-from common import ROOT, commit, commit_of, finished_runs, write_csv
+from common import ROOT, UsageError, commit, commit_of, finished_runs, run_main, write_csv
 
 
 @dataclass
@@ -51,13 +50,16 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
-if __name__ == "__main__":
-    args = tyro.cli(Args, description=__doc__.split("\n\n")[0])
+def main(args: Args) -> None:
     found = read_runs(args.runs)
     if not found:
-        raise SystemExit(f"error: --runs {args.runs}: holds no finished run")
+        raise UsageError(f"--runs {args.runs}: holds no finished run")
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "players.csv", found)
     text = f"`benchmark/fourrooms_players.py` at {commit()}; one thread each, beside other processes.\n\n{table(found)}"
     (args.out / "players.md").write_text(text)
     print(text)
+
+
+if __name__ == "__main__":
+    run_main(main, Args, __doc__)

@@ -13,9 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 from apple_report import with_interval
-from common import ROOT, commit, commit_of, write_csv
+from common import ROOT, commit, commit_of, run_main, write_csv
 
 
 @dataclass
@@ -88,4 +87,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    run_main(main, Args, __doc__)

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from apple_players import load_method
-from common import ROOT, commit, published_table, write_csv
+from common import ROOT, commit, published_table, run_main, write_csv
 
 ENV_ID = "ALE/Gopher-v5"
 UNITS = {  # a score of each episode, or of each of its lives
@@ -97,4 +96,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_main(main, Args, __doc__)

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from apple_report import with_interval
-from common import ROOT, commit, commit_of, finished_runs, write_csv
+from common import ROOT, UsageError, commit, commit_of, finished_runs, run_main, write_csv
 from gopher_report import WINDOW, teacher_curve
 from matplotlib.figure import Figure
 
@@ -87,7 +86,7 @@ def curves(runs: list[Path], random: float) -> Figure:
 def main(args: Args) -> None:
     finished = sorted(finished_runs(args.runs))
     if not finished:
-        raise SystemExit(f"error: --runs {args.runs}: holds no finished run")
+        raise UsageError(f"--runs {args.runs}: holds no finished run")
     rows, random = [row_of(run, result) for run, result in finished], random_score()
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "ram.csv", rows)
@@ -102,4 +101,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
+    run_main(main, Args, __doc__)

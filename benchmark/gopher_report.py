@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from apple_report import (
     ACTS,
     alpha_curve,
@@ -26,7 +25,7 @@ from apple_report import (
     temperatures,
     with_interval,
 )
-from common import ROOT, commit, commit_of, finished_runs, published_table, write_csv
+from common import ROOT, UsageError, commit, commit_of, finished_runs, published_table, run_main, write_csv
 from gopher_players import Args as PlayersArgs
 from gopher_players import load_method, measure
 from matplotlib.figure import Figure
@@ -234,7 +233,7 @@ def provenance(rows: list[dict]) -> str:
 def main(args: Args) -> None:
     rows = read_runs(args.runs)
     if not rows:
-        raise SystemExit(f"--runs {args.runs}: holds no finished run")
+        raise UsageError(f"--runs {args.runs}: holds no finished run")
     lives = [row for row in rows if row["unit"] == LIVES]
     human = human_rows(sorted({row["seed"] for row in rows}), args.human_episodes)
     human_score = mean_score(by_seed(human))
@@ -258,4 +257,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_main(main, Args, __doc__)

@@ -26,8 +26,7 @@ from pathlib import Path
 import numpy as np
 import safetensors.torch
 import torch
-import tyro
-from common import ROOT, commit, commit_of, finished_runs, write_csv
+from common import ROOT, UsageError, commit, commit_of, finished_runs, run_main, write_csv
 from hwm_report import FLOORS, IGNORANT, above_floors, best_floors, interval
 from matplotlib.figure import Figure
 
@@ -156,7 +155,7 @@ def main(args: Args) -> None:
     groups = [seeds[i : i + args.trained] for i in range(0, len(seeds) - args.trained + 1, args.trained)]
     if not groups:
         found = f"has {len(seeds)} finished runs {args.rung}_seedN from --first-seed {args.first_seed} on"
-        raise SystemExit(f"error: --runs {args.runs}: {found}, --trained {args.trained} are needed")
+        raise UsageError(f"--runs {args.runs}: {found}, --trained {args.trained} are needed")
     rows, committees = [], []
     for group in groups:
         parts = {seed: segment(runs[seed]) for seed in group}
@@ -185,4 +184,4 @@ def main(args: Args) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
+    run_main(main, Args, __doc__)

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
-from common import ROOT, commit, commit_of, finished_runs, write_csv
+from common import ROOT, UsageError, commit, commit_of, finished_runs, run_main, write_csv
 from scipy import stats
 
 RUNGS = {
@@ -83,12 +82,12 @@ def read_runs(folder: Path) -> list[dict]:
 
 
 def read_known(folder: Path, rows: list[dict]) -> list[dict]:
-    """The rows of an earlier report whose runs are not among `rows`. Raises SystemExit where there is none to read."""
+    """The rows of an earlier report whose runs are not among `rows`. Raises UsageError where there is none to read."""
     try:
         with open(folder / "runs.csv", newline="") as file:
             known = list(csv.DictReader(file))
     except OSError as error:
-        raise SystemExit(f"error: --known {folder}: runs.csv cannot be read: {error.strerror}") from None
+        raise UsageError(f"--known {folder}: runs.csv cannot be read: {error.strerror}") from None
     runs, words = {row["run"] for row in rows}, {"rung", "run", "script_sha256", "m"}
     return [
         {key: value if key in words else float(value) for key, value in row.items()} | {"seed": int(row["seed"])}
@@ -177,11 +176,14 @@ def write_report(rows: list[dict], runs: Path, out: Path) -> None:
     print("\n".join(text))
 
 
-if __name__ == "__main__":
-    arguments = tyro.cli(Args, description=__doc__.split("\n\n")[0])
-    found = read_runs(arguments.runs)
-    if arguments.known is not None:
-        found = read_known(arguments.known, found) + found
+def main(args: Args) -> None:
+    found = read_runs(args.runs)
+    if args.known is not None:
+        found = read_known(args.known, found) + found
     if not found:
-        raise SystemExit(f"error: --runs {arguments.runs}: holds no finished run")
-    write_report(found, arguments.runs, arguments.out)
+        raise UsageError(f"--runs {args.runs}: holds no finished run")
+    write_report(found, args.runs, args.out)
+
+
+if __name__ == "__main__":
+    run_main(main, Args, __doc__)

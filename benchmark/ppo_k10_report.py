@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
-from common import finished_runs, write_csv
+from common import UsageError, finished_runs, run_main, write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -120,7 +119,7 @@ def ppo_k10_figure(published: list[dict], runs: list[dict], folder: Path) -> Fig
 def main(args: Args) -> None:
     published, runs = read_csv(BENCHMARK / "published" / "ppo_k10_seeds.csv"), read_runs(args.runs)
     if not runs:
-        raise SystemExit(f"--runs {args.runs}: holds no finished run")
+        raise UsageError(f"--runs {args.runs}: holds no finished run")
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "runs.csv", runs)
     table = ppo_k10_table(published, runs)
@@ -131,4 +130,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
+    run_main(main, Args, __doc__)

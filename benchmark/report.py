@@ -29,8 +29,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import tyro
-from common import ROOT, commit, commit_of, published_rows, write_csv
+from common import ROOT, UsageError, commit, commit_of, published_rows, run_main, write_csv
 from matplotlib.figure import Figure
 
 METHODS = {"PPO": "PPO", "stop": "KLE-Stop", "rollback": "KLE-Rollback"}
@@ -153,7 +152,7 @@ def read_run(steps: int, folder: Path) -> dict:
 def read_runs(folder: Path, steps: int, workers: int) -> list[dict]:
     """All runs of a folder; those that have not come to `steps` have no curves.
 
-    Raises SystemExit where runs are not of one study.
+    Raises UsageError where runs are not of one study.
     """
     folders = sorted(path.parent for path in folder.glob("*/updates.csv"))
     with ProcessPoolExecutor(workers) as pool:
@@ -161,25 +160,25 @@ def read_runs(folder: Path, steps: int, workers: int) -> list[dict]:
     for run, path in zip(runs, folders):
         other = next((key for key, value in runs[0]["args"].items() if run["args"].get(key) != value), None)
         if other is not None:
-            raise SystemExit(f"{path}: has another {other} than {folders[0]}; a report is of one study")
+            raise UsageError(f"{path}: has another {other} than {folders[0]}; a report is of one study")
     settings = [tuple(run["row"][key] for key in SETTING) for run in runs]
     twice = next((path for path, setting in zip(folders, settings) if settings.count(setting) > 1), None)
     if twice is not None:
-        raise SystemExit(f"{twice}: is there twice, under another name")
+        raise UsageError(f"{twice}: is there twice, under another name")
     return runs
 
 
 def read_known(folder: Path, steps: int) -> list[dict]:
     """The runs of an earlier report as `read_runs` gives them; without curves where the report has kept none.
 
-    Raises SystemExit where they are not of `steps`.
+    Raises UsageError where they are not of `steps`.
     """
     curves = dict(np.load(folder / "curves.npz")) if (folder / "curves.npz").exists() else {}
     with open(folder / "runs.csv", newline="") as file:
         rows = [{key: number(key, value) for key, value in row.items()} for row in csv.DictReader(file)]
     other = next((row["steps"] for row in rows if not 0.9 * steps < row["steps"] <= steps), None)
     if other is not None:
-        raise SystemExit(f"--known {folder}: holds runs of {other:,} steps, not of {steps:,}")
+        raise UsageError(f"--known {folder}: holds runs of {other:,} steps, not of {steps:,}")
     runs = [{"row": {key: value for key, value in row.items() if value != "" or key == "d_target"}} for row in rows]
     for run in runs:
         run["curves"] = dict(zip(CURVES, curves[key])) if (key := run_name(run["row"])) in curves else {}
@@ -875,7 +874,7 @@ def main(args: Args) -> None:
     known = read_known(args.known, args.steps) if args.known else []
     runs = in_order(of_folders, known)
     if not runs:
-        raise SystemExit(f"--runs {args.runs}: holds no run of {args.steps:,} steps")
+        raise UsageError(f"--runs {args.runs}: holds no run of {args.steps:,} steps")
     out = args.out or ROOT / "benchmark" / "results" / "ppo_kle" / f"{args.steps}"
     out.mkdir(parents=True, exist_ok=True)
     timed = timed_runs(args, in_order(found, known))
@@ -901,4 +900,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
+    run_main(main, Args, __doc__)

@@ -4,6 +4,9 @@ It needs an older Gymnasium, and so an environment of its own:
 
 python -m venv PEER && PEER/bin/pip install sheeprl==0.5.7 "numpy<2" "setuptools<80"
 PEER/bin/python benchmark/sheeprl_dreamer.py
+
+Its dreams are differentiated even where REINFORCE, its default as ours, gives those gradients a weight of 0; ours are not. Its steps
+are on data that lies ready; ours draw theirs from the replay.
 """
 
 import time

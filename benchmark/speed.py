@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
+from common import ROOT, UsageError, run_main
 
-ROOT = Path(__file__).resolve().parent.parent
 PEER = "stable-baselines3"
 
 
@@ -296,7 +296,12 @@ def time_dreamer(args: Args) -> None:
     import torch
 
     if args.sheeprl and not args.sheeprl.is_file():
-        raise SystemExit(f"error: --sheeprl {args.sheeprl}: must be the Python of an environment with sheeprl")
+        raise UsageError(f"--sheeprl {args.sheeprl}: must be the Python of an environment with sheeprl")
+    look = "import importlib.util, sys; sys.exit(importlib.util.find_spec('sheeprl') is None)"
+    if args.sheeprl and subprocess.run([args.sheeprl.absolute(), "-c", look]).returncode:
+        raise UsageError(
+            f"--sheeprl {args.sheeprl}: has no sheeprl; benchmark/sheeprl_dreamer.py says how to install it"
+        )
     results = []
     has_bf16 = torch.ops.mkldnn._is_mkldnn_bf16_supported()
     for title, (script, size, forms) in DREAMERS.items():
@@ -312,13 +317,20 @@ def time_dreamer(args: Args) -> None:
         if args.sheeprl and size == "m":
             contenders["sheeprl"] = lambda: time_peer("sheeprl_dreamer.py", python=args.sheeprl.absolute())
         results.append({**measure(Work(title, None, 1), contenders, args.rounds), "milliseconds": parts})
-    write_results(args, "dreamer", "", results, text=dreamer_table(results))
+    write_results(args, "dreamer", " --sheeprl PYTHON" if args.sheeprl else "", results, text=dreamer_table(results))
+
+
+def main(args: Args) -> None:
+    if args.rounds < 1:
+        raise UsageError(f"--rounds {args.rounds}: must be at least 1")
+    if args.sheeprl and args.what != "dreamer":
+        raise UsageError(f"--sheeprl {args.sheeprl}: is a peer of `dreamer` only, not of `{args.what}`")
+    times = {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail, "rooms": time_rooms}
+    times |= {"dreamer": time_dreamer, "gopher": time_gopher}
+    times[args.what](args)
 
 
 if __name__ == "__main__":
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # before numpy is imported
-    arguments = tyro.cli(Args)
-    times = {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail, "rooms": time_rooms}
-    times |= {"dreamer": time_dreamer, "gopher": time_gopher}
-    times[arguments.what](arguments)
+    run_main(main, Args, __doc__)

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import safetensors.torch
-import tyro
-from common import ROOT, commit, published_table, write_csv
+from common import ROOT, UsageError, commit, published_table, run_main, write_csv
 
 from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import gail_hybrid as gail
@@ -102,7 +101,7 @@ def main(args: Args) -> None:
         return write_demonstrations(args)
     results = [json.loads(path.read_text()) for path in sorted(args.runs.glob("expert_seed*/result.json"))]
     if not results:
-        raise SystemExit(f"--runs {args.runs}: holds no finished expert_seed*, to compare with")
+        raise UsageError(f"--runs {args.runs}: holds no finished expert_seed*, to compare with")
     experts = [result["evaluation"]["driving"] for result in results]
     expert = float(np.mean([scores["score"]["mean"] for scores in experts]))
     length = gail.Track(*gail.TRACKS["meadow"]).length
@@ -125,4 +124,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    run_main(main, Args, __doc__)

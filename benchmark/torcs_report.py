@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 from apple_report import interval, with_interval
-from common import ROOT, commit, commit_of, published_table, write_csv
+from common import ROOT, UsageError, commit, commit_of, published_table, run_main, write_csv
 from matplotlib.figure import Figure
 
 from cleanrl_thesis import gail_hybrid as gail
@@ -392,9 +391,9 @@ def provenance(rows: list[dict]) -> str:
 def main(args: Args) -> None:
     rows = read_runs(args.runs, args.expert)
     if not rows:
-        raise SystemExit(f"--runs {args.runs}: holds no finished run")
+        raise UsageError(f"--runs {args.runs}: holds no finished run")
     if not select(rows, "expert", "demonstrations"):
-        raise SystemExit(
+        raise UsageError(
             f"--expert {args.expert}: {args.runs} holds no finished run of that expert with demonstrations"
         )
     track, found = gail.Track(*gail.TRACKS["meadow"]), drivers(args.runs, args.expert, 20)
@@ -419,4 +418,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    run_main(main, Args, __doc__)

@@ -20,12 +20,10 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
-import tyro
+from common import ROOT, run_main
 from scipy import stats
 
 from cleanrl_thesis import gail_hybrid as gail
-
-ROOT = Path(__file__).resolve().parent.parent
 
 
 @dataclass
@@ -120,4 +118,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    run_main(main, Args, __doc__)

@@ -284,6 +284,24 @@ def test_who_does_not_see_z_knows_of_the_goal_by_the_skill(sees_z, hidden):
     assert not torch.equal(*behaviour.high_policy(features))
 
 
+def test_eight_skills_by_hand_lead_to_every_goal():
+    """What eight can do through the same two levels: their own count of returns and the instrument's agree."""
+    model = dreamer_skills.Segments(4)
+    tables = dreamer_skills.Tables(model)
+    maze, by_goal = method.maze(11), tables.returns(model)
+    returns = dreamer_skills.true_returns(tables, model)
+    assert returns.min() > 0 and returns.mean() > 0.86
+    pose, goal = maze.starts[5_000]  # walked by hand, reading the tables
+    place, age, skill, steps = int(maze.rooms[pose // 4]), 0, 0, 0
+    while pose // 4 != goal:
+        skill = int(tables.skills[place, goal]) if age == 0 else skill
+        pose, steps = maze.moves[pose, int(tables.actions[skill, pose])], steps + 1
+        age = (age + 1) % 4
+        place = int(maze.rooms[pose // 4]) if age == 0 else place
+    assert returns[5_000] == pytest.approx(1 - 0.9 * steps / 100)
+    assert by_goal[np.unique(maze.starts[:, 1])].min() > 0.8
+
+
 def test_use_of_skills():
     """Skills that tell two classes of goals apart say ln 2 of z; actions that follow them by halves say ln 2 of those."""
     model = dreamer_skills.Segments(0)
