@@ -161,7 +161,10 @@ def read_manifest(path: Path) -> list[Run]:
 
 
 def open_manifest(args: Args, runs: list[Run]) -> None:
-    """Write the manifest, unless it is there. Raises UsageError where runs were begun otherwise."""
+    """Write the manifest, unless it is there. Raises UsageError where runs were begun otherwise, or cannot begin."""
+    require(args.runs.is_dir() or not args.runs.exists(), f"--runs {args.runs}: must be a folder")
+    for script in [word for word in shlex.split(args.command) if word.endswith(".py")][:1]:
+        require(Path(script).is_file(), f"--command {args.command}: there is no {script}")
     path = manifest_path(args)
     manifests = {other: read_manifest(other) for other in sorted(args.runs.glob("*.jsonl"))}
     if manifests.get(path) == runs:

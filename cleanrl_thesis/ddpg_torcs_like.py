@@ -1491,9 +1491,19 @@ def read_arguments(run_dir: Path) -> dict:
         raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
 
 
+def check_disk(args: Args, flag: str, value: int, size: int) -> None:
+    """Raise UsageError where the replay of a new run, a file of `size` bytes, has no room."""
+    folder = (args.run_dir or Path("runs")).absolute()
+    if not (folder / "replay.dat").exists():
+        free = shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
+        require(size <= free, flag, value, f"its replay takes {size / 1e9:,.1f} GB of disk, {free / 1e9:,.1f} are left")
+
+
 def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
     """Raise UsageError unless the saved arguments agree with all that the results depend on."""
     current = arguments(args)
+    allowed = f"{run_dir} holds a run of another script or version, {saved.get('exp_name')}"
+    require(saved.keys() <= current.keys(), "--resume", "", allowed)
     changed = [name for name in current if name not in FREE_ON_RESUME and current[name] != saved.get(name)]
     differences = [f"--{name.replace('_', '-')} {current[name]} (was {saved.get(name)})" for name in changed]
     require(not changed, "--resume", ", ".join(differences), f"must be as in {run_dir}")
@@ -1855,6 +1865,8 @@ def main(args: Args) -> int:
     env = make_env(args.env_id, **env_options(args))
     if args.capture_video:
         check_video(args.env_id)
+    row = 4 * (2 * env.observation_space.shape[0] + env.action_space.shape[0] + 2)
+    check_disk(args, "--buffer-size", args.buffer_size, args.buffer_size * row)
     run_dir, checkpoint = open_run_dir(args)
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / args.rollout_steps))
     if is_done(run_dir, args, last_iteration * args.rollout_steps):
@@ -2046,7 +2058,7 @@ def cli(argv: list[str] | None = None) -> int:
         return 2
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
-    except OSError as error:
+    except (OSError, MemoryError) as error:
         print(f"error: {error}; a checkpoint stays whole: go on with --run-dir and --resume", file=sys.stderr)
     return 1
 

@@ -50,6 +50,7 @@ import math
 import os
 import platform
 import resource
+import shutil
 import signal
 import sys
 import time
@@ -227,6 +228,9 @@ def complete_args(args: Args) -> Args:
     args.num_iterations = args.total_timesteps // frames
     allowed = f"must be at least one step of every game, {frames} frames"
     require(args.num_iterations >= 1, "--total-timesteps", args.total_timesteps, allowed)
+    learns = args.learning_starts < args.total_timesteps
+    allowed = f"must be less than --total-timesteps, {args.total_timesteps}"
+    require(learns, "--learning-starts", args.learning_starts, allowed)
     rows = args.frame_stack + args.n_step + 1  # of two to draw from, one may begin no transition
     least = rows * args.num_envs
     allowed = f"must be at least --frame-stack, --n-step and one more frames of every game, {least}"
@@ -734,9 +738,19 @@ def read_arguments(run_dir: Path) -> dict:
         raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
 
 
+def check_disk(args: Args, flag: str, value: int, size: int) -> None:
+    """Raise UsageError where the replay of a new run, a file of `size` bytes, has no room."""
+    folder = (args.run_dir or Path("runs")).absolute()
+    if not (folder / "replay.dat").exists():
+        free = shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
+        require(size <= free, flag, value, f"its replay takes {size / 1e9:,.1f} GB of disk, {free / 1e9:,.1f} are left")
+
+
 def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
     """Raise UsageError unless the saved arguments agree with all that the results depend on."""
     current = arguments(args)
+    allowed = f"{run_dir} holds a run of another script or version, {saved.get('exp_name')}"
+    require(saved.keys() <= current.keys(), "--resume", "", allowed)
     changed = [name for name in current if name not in FREE_ON_RESUME and current[name] != saved.get(name)]
     differences = [f"--{name.replace('_', '-')} {current[name]} (was {saved.get(name)})" for name in changed]
     require(not changed, "--resume", ", ".join(differences), f"must be as in {run_dir}")
@@ -1059,6 +1073,8 @@ def main(args: Args) -> int:
     games = [make_atari(args.env_id, **game_options(args)) for _ in range(args.num_envs)]
     if args.capture_video:
         check_video(args)
+    row = row_type(games[0].observation_space.shape[1:]).itemsize
+    check_disk(args, "--buffer-size", args.buffer_size, min(args.buffer_size, args.total_timesteps) * row)
     run_dir, checkpoint = open_run_dir(args)
     frames_per_step = args.num_envs * args.frame_skip
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / frames_per_step))
@@ -1231,7 +1247,7 @@ def cli(argv: list[str] | None = None) -> int:
         return 2
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
-    except OSError as error:
+    except (OSError, MemoryError) as error:
         print(f"error: {error}; a checkpoint stays whole: go on with --run-dir and --resume", file=sys.stderr)
     return 1
 

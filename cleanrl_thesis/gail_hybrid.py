@@ -1602,6 +1602,8 @@ def read_arguments(run_dir: Path) -> dict:
 def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
     """Raise UsageError unless the saved arguments agree with all that the results depend on."""
     current = arguments(args)
+    allowed = f"{run_dir} holds a run of another script or version, {saved.get('exp_name')}"
+    require(saved.keys() <= current.keys(), "--resume", "", allowed)
     changed = [name for name in current if name not in FREE_ON_RESUME and current[name] != saved.get(name)]
     differences = [f"--{name.replace('_', '-')} {current[name]} (was {saved.get(name)})" for name in changed]
     require(not changed, "--resume", ", ".join(differences), f"must be as in {run_dir}")
@@ -2173,7 +2175,7 @@ def cli(argv: list[str] | None = None) -> int:
         return 2
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
-    except OSError as error:
+    except (OSError, MemoryError) as error:
         print(f"error: {error}; a checkpoint stays whole: go on with --run-dir and --resume", file=sys.stderr)
     return 1
 

@@ -125,9 +125,20 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
         raise UsageError(f"{flag} {value}".strip() + f": {allowed}")
 
 
+def read_player(folder: Path) -> str:
+    """Who is recorded in a folder. Raises UsageError."""
+    try:
+        return str(json.loads((folder / "manifest.json").read_text())["player"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UsageError(f"--out {folder}: holds no recordings, it has no readable manifest.json") from None
+
+
 def complete_args(args: Args) -> Args:
     """Fill in the folder, and check all. Raises UsageError."""
-    if not args.practice:
+    reads = args.verify or args.export_minari is not None
+    if reads and args.player is None and args.out is not None:
+        args.player = read_player(args.out)
+    elif not args.practice:
         require(args.player is not None, "--player", "", "is needed: who plays? (--practice records nothing)")
         named = re.fullmatch(r"[\w-]{1,40}", args.player) is not None
         require(named, "--player", args.player, "must be 1 to 40 letters, digits, - or _")

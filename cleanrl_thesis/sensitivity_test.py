@@ -709,7 +709,7 @@ def export(args: Args) -> int:
         with contextlib.closing(sqlite3.connect(f"{args.db.resolve().as_uri()}?mode=ro", uri=True)) as db:
             answers = db.execute(query).fetchall()
     except sqlite3.Error as error:
-        raise UsageError(f"--db {args.db}: {first_line(error)}") from None
+        raise UsageError(f"--db {args.db}: is no database of a study: {first_line(error)}") from None
     require(bool(answers), "--db", args.db, "holds no answers yet")
     rows = count_verdicts(answers, args.seed)
     names = ("participant", "agent", "verdict", "position", "clip", "comment", "age", "gender")

@@ -12,7 +12,7 @@ from conftest import ROOT
 from scipy import stats
 
 sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
-
+from common import UsageError, run_main  # noqa: E402
 
 names = ("ppo_k10_report", "speed", "apple_report", "torcs_report")
 report, speed, apple, torcs = map(importlib.import_module, names)
@@ -76,8 +76,19 @@ def test_dreamer_table_has_the_parts_of_ours_alone():
 
 
 def test_a_sheeprl_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(SystemExit, match="--sheeprl"):
+    with pytest.raises(UsageError, match="--sheeprl"):
         speed.time_dreamer(speed.Args("dreamer", sheeprl=tmp_path / "none"))
+
+
+@pytest.mark.parametrize(
+    "words, complaint", [(["ppo", "--rounds", "0"], "--rounds 0"), (["ppo", "--sheeprl", "x"], "--sheeprl x")]
+)
+def test_a_wrong_value_is_one_line_and_exit_code_2(words, complaint, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["speed.py", *words])
+    with pytest.raises(SystemExit) as stop:
+        run_main(speed.main, speed.Args, speed.__doc__)
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and err.startswith(f"error: {complaint}: ") and err.count("\n") == 1
 
 
 def test_speed_table_has_medians_and_ratios_round_by_round():

@@ -24,6 +24,7 @@ import dreamer_goals  # noqa: E402
 import dreamer_reads  # noqa: E402
 import dreamer_report  # noqa: E402
 import dreamer_true  # noqa: E402
+from common import UsageError  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "dreamer_v2.py"
 CPU = torch.device("cpu")
@@ -741,6 +742,13 @@ def test_a_folder_of_another_run_is_refused(small_run, tmp_path):
     assert all(word in done.stderr for word in words) and done.stderr.count("\n") == 1
 
 
+def test_a_folder_of_another_script_is_refused(small_run, tmp_path):
+    done = run(
+        "--run-dir", small_run, "--resume", cwd=tmp_path, code=2, script=ROOT / "cleanrl_thesis" / "dqn_apple.py"
+    )
+    assert "holds a run of another script or version, dreamer_v2" in done.stderr and done.stderr.count("\n") == 1
+
+
 @pytest.mark.parametrize("change", [lambda path: path.unlink(), lambda path: path.write_bytes(path.read_bytes()[:99])])
 def test_a_run_does_not_go_on_without_its_replay(tmp_path, change):
     run(*SMALL, "--run-dir", "run", "--stop-at", 1000, cwd=tmp_path, script=SCRIPT)
@@ -883,11 +891,11 @@ def test_steps_to_a_return_and_curves(tmp_path):
     assert all(
         np.allclose(a["means"], b["means"]) and np.array_equal(a["steps"], b["steps"]) for a, b in zip(runs, later)
     )
-    with pytest.raises(SystemExit, match="--known .*: cannot be read"):
+    with pytest.raises(UsageError, match="--known .*: cannot be read"):
         dreamer_report.read_known(tmp_path)
     path = tmp_path / "runs" / "dreamer_seed1" / "episodes.csv"
     path.write_text("".join(path.read_text().splitlines(True)[: 1 + 200 + 49]))
-    with pytest.raises(SystemExit, match="holds no run"):  # its first mean is yet to come
+    with pytest.raises(UsageError, match="holds no run"):  # its first mean is yet to come
         dreamer_report.read_runs(tmp_path / "runs")
 
 
@@ -899,9 +907,9 @@ def test_goals_by_what_the_replay_paid(small_run, capsys):
     assert rewards == (episodes["episodic_return"] > 0).sum()
     cells, played = (sum(int(line.split("|")[column]) for line in lines[3:]) for column in (2, 3))
     assert cells == 64 and played == 50
-    with pytest.raises(SystemExit, match="no checkpoint"):
+    with pytest.raises(UsageError, match="no checkpoint"):
         dreamer_goals.main(dreamer_goals.Args(small_run.parent))
-    with pytest.raises(SystemExit, match="whose model has no segments"):
+    with pytest.raises(UsageError, match="whose model has no segments"):
         dreamer_reads.main(dreamer_reads.Args(small_run))
 
 
@@ -930,5 +938,5 @@ def test_moving_mean():
 
 
 def test_a_folder_without_runs_is_refused(tmp_path):
-    with pytest.raises(SystemExit, match="holds no run"):
+    with pytest.raises(UsageError, match="holds no run"):
         dreamer_report.read_runs(tmp_path)

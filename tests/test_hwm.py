@@ -22,6 +22,7 @@ from cleanrl_thesis import ppo_fourrooms as rooms
 sys.path.append(str(ROOT / "benchmark"))
 import hwm_agreement  # noqa: E402
 import hwm_report  # noqa: E402
+from common import UsageError  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "hwm_segment.py"
 FAITHFUL = {  # rung (a) of benchmark/hwm_segment.sh
@@ -770,7 +771,7 @@ def test_report_of_part_of_the_runs(small_run, tmp_path):
     hwm_report.write_report(rows, tmp_path / "runs", tmp_path / "out")
     known = hwm_report.read_known(tmp_path / "out", rows[:3])
     assert known == [row for row in rows if row["run"] != rows[0]["run"]]
-    with pytest.raises(SystemExit, match="--known .*: runs.csv cannot be read"):
+    with pytest.raises(UsageError, match="--known .*: runs.csv cannot be read"):
         hwm_report.read_known(tmp_path, rows)
     table = (tmp_path / "out" / "table.md").read_text()
     read_rate = segmentation["prior"]["read_rate"]
@@ -856,5 +857,5 @@ def test_report_of_agreement(small_run, tmp_path):
     assert float(rows[0]["kl_m"]) == 2 * float(rows[1]["kl_m"]) == 2 * float(rows[2]["kl_m"]) > 0
     measured = json.loads((small_run / "segmentation.json").read_text())["prior"]
     assert all(float(rows[0][key]) == measured[key] for key in hwm_agreement.MEASURES)
-    with pytest.raises(SystemExit, match=r"--runs .* has 1 finished runs narrow_seedN"):
+    with pytest.raises(UsageError, match=r"--runs .* has 1 finished runs narrow_seedN"):
         hwm_agreement.main(replace(args, first_seed=3))

@@ -383,6 +383,14 @@ def test_a_folder_that_does_not_fit_is_refused(flags, damage, words, tmp_path, c
     assert_refused(record, capsys, ["--player", "anna", "--out", args.out, *flags, "--port", 0], words)
 
 
+def test_verify_reads_who_played(tmp_path, capsys):
+    args = make_args(folder=tmp_path / "anna")
+    add(record.Recordings.open(args.out, record.about_recordings(args, record.make_game(args))), 1)
+    assert record.cli(["--out", str(args.out), "--verify"]) == 0
+    assert "the same again" in capsys.readouterr().out
+    assert_refused(record, capsys, ["--out", tmp_path, "--verify"], ["--out", "no recordings"])
+
+
 def test_verify_finds_other_rewards(tmp_path, capsys):
     args = make_args(folder=tmp_path / "anna")
     add(record.Recordings.open(args.out, record.about_recordings(args, record.make_game(args))), 1)

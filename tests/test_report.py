@@ -14,6 +14,8 @@ from conftest import ROOT
 from scipy import stats
 
 sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
+from common import UsageError  # noqa: E402
+
 report = importlib.import_module("report")
 
 UPDATES = "global_step,charts/update_iterations,losses/kl_exact_new_old\n"
@@ -250,17 +252,17 @@ def test_runs_of_another_study_are_refused(study, tmp_path):
     for name in ("Hopper-v2_PPO_10_None_1", "Hopper-v2_PPO_10_None_2"):
         shutil.copytree(study / name, tmp_path / name)
     shutil.copytree(study / "Hopper-v2_PPO_10_None_1", tmp_path / "again")
-    with pytest.raises(SystemExit, match="is there twice"):
+    with pytest.raises(UsageError, match="is there twice"):
         report.read_runs(tmp_path, 102_400, 1)
     shutil.rmtree(tmp_path / "again")
     path = tmp_path / "Hopper-v2_PPO_10_None_2" / "args.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "batch_size": 1024}))
-    with pytest.raises(SystemExit, match="has another batch_size than"):
+    with pytest.raises(UsageError, match="has another batch_size than"):
         report.read_runs(tmp_path, 102_400, 1)
 
 
 def test_a_folder_without_runs_says_so(tmp_path):
-    with pytest.raises(SystemExit, match="holds no run of 2,000,000 steps"):
+    with pytest.raises(UsageError, match="holds no run of 2,000,000 steps"):
         report.main(report.Args(runs=tmp_path, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
@@ -341,7 +343,7 @@ def test_runs_whose_folders_are_gone_count_on(study, tmp_path):
 def test_an_earlier_report_without_curves(study, tmp_path):
     report.main(report.Args(runs=study, steps=102_400, out=tmp_path / "out", workers=1))
     (tmp_path / "out" / "curves.npz").unlink()
-    with pytest.raises(SystemExit, match="not of 500,000"):
+    with pytest.raises(UsageError, match="not of 500,000"):
         report.read_known(tmp_path / "out", 500_000)
     runs = report.read_known(tmp_path / "out", 102_400)
     assert not any(run["curves"] for run in runs) and {run["row"]["d_target"] for run in runs} == {"", 0.03, 0.05}

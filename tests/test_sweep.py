@@ -293,6 +293,8 @@ def test_a_full_disk_stops_the_sweep_and_loses_nothing(tmp_path):
         (["--name", "a b"], "--name a b"),
         (["--slurm-template-path", "no/such"], "--slurm-template-path no/such: no such file"),
         (["--only", "3"], "runs/sweep.jsonl: no readable manifest"),
+        (["--runs", TOY], "toy_run.py: must be a folder"),
+        (["--command", "python no/such.py"], "--command python no/such.py: there is no no/such.py"),
     ],
 )
 def test_bad_input_is_one_line_and_makes_nothing(flags, words, tmp_path):
