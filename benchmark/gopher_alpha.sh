@@ -5,16 +5,21 @@
 #   benchmark/gopher_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
 #   THREADS=2 benchmark/gopher_alpha.sh     the teacher with two threads
+#   ALPHAS=0.0 TEMPERATURES= TEACHER= benchmark/gopher_alpha.sh     the human's clones alone, which need no teacher
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/gopher}
-OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1}
+OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1} TEACHER=${TEACHER-$RUNS/teacher_seed1}
 ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
 TEMPERATURES=${TEMPERATURES-0.1 0 1} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0 0.5}
 mkdir -p "$RUNS"
-"$PYTHON" cleanrl_thesis/dqn_gopher.py --bf16 --num-threads "$THREADS" --save-model --run-dir "$RUNS/teacher_seed1" --resume
+if [ -n "$TEACHER" ]; then
+  "$PYTHON" cleanrl_thesis/dqn_gopher.py --bf16 --num-threads "$THREADS" --save-model --run-dir "$TEACHER" --resume
+fi
 student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
-  echo --seed "$1" --alpha "$2" --run-dir "$RUNS/$3_seed$1" "${@:4}"
+  local teacher="--teacher $TEACHER"
+  if [ "$2" = 0.0 ]; then teacher=; fi  # a clone of the human
+  echo --seed "$1" --alpha "$2" --run-dir "$RUNS/$3_seed$1" $teacher "${@:4}"
 }
 {
   for alpha in $ALPHAS; do
@@ -25,6 +30,6 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
       for seed in $SEEDS; do student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"; done
     done
   done
-} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --teacher "$RUNS/teacher_seed1" \
-  --bf16 --eval-episodes 50 --save-model --resume
+} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 \
+  --eval-episodes 50 --save-model --resume
 "$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT"
