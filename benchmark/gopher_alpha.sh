@@ -14,7 +14,9 @@ ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
 TEMPERATURES=${TEMPERATURES-0.1 0 1} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0 0.5}
 mkdir -p "$RUNS"
 if [ -n "$TEACHER" ]; then
-  "$PYTHON" cleanrl_thesis/dqn_gopher.py --bf16 --num-threads "$THREADS" --save-model --run-dir "$TEACHER" --resume
+  # lives end episodes as in Baselines; targets of three steps stand for its prioritised replay
+  "$PYTHON" cleanrl_thesis/dqn_gopher.py --life-loss-ends --n-step 3 --bf16 --num-threads "$THREADS" --save-model \
+    --run-dir "$TEACHER" --resume
 fi
 student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
   local teacher="--teacher $TEACHER"
