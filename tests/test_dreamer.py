@@ -861,6 +861,8 @@ def test_steps_to_a_return_and_curves(tmp_path):
         (folder / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + "\n".join(lines) + "\n")
         columns = "global_step,eval/real_return,eval/dreamed_return\n"
         (folder / "updates.csv").write_text(columns + "5000,0.2,0.5\n10000,nan,nan\n")
+        ended = {"training_seconds": 120.0, "script_sha256": "none", "evaluation": {"mean": 0.8}}
+        (folder / "result.json").write_text(json.dumps(ended))
     runs = dreamer_report.read_runs(tmp_path / "runs")
     rows = {(run["row"]["agent"], run["row"]["seed"]): run["row"] for run in runs}
     assert rows["dreamer", 1]["steps_to_0.5"] == 10 * (300 + 100) - 2_000 and np.isnan(rows["hwm", 1]["steps_to_0.5"])
@@ -871,7 +873,8 @@ def test_steps_to_a_return_and_curves(tmp_path):
     assert np.allclose(runs[0]["means"][[52, 150]], [(0.1 * 100 + 0.9 * 2) / 102, 0.5])
     lines = dreamer_report.table([run["row"] for run in runs])
     assert (
-        lines[2].startswith("| Dreamer | 2 | 3,000 ± 12,706 | ") and "| not reached | not reached | 0.100 |" in lines[3]
+        lines[2].startswith("| Dreamer | 2 | 8,000 | 3,000 ± 12,706 | ")
+        and "| not reached | not reached | 0.100 | 0.800 |" in lines[3]
     )
     assert "| 0.300 ± 0.000 |" in lines[2]
     dreamer_report.write_report(runs, tmp_path / "out")
@@ -893,6 +896,14 @@ def test_steps_to_a_return_and_curves(tmp_path):
     )
     with pytest.raises(UsageError, match="--known .*: cannot be read"):
         dreamer_report.read_known(tmp_path)
+    (tmp_path / "out" / "curves.npz").write_bytes(b"torn")
+    with pytest.raises(UsageError, match="--known .*: cannot be read"):
+        dreamer_report.read_known(tmp_path / "out")
+    (tmp_path / "runs" / "dreamer_seed1" / "result.json").unlink()  # as if it went on
+    assert (
+        "| Dreamer | 1 |"
+        in dreamer_report.table([run["row"] for run in dreamer_report.read_runs(tmp_path / "runs", later[1:])])[2]
+    )
     path = tmp_path / "runs" / "dreamer_seed1" / "episodes.csv"
     path.write_text("".join(path.read_text().splitlines(True)[: 1 + 200 + 49]))
     with pytest.raises(UsageError, match="holds no run"):  # its first mean is yet to come
