@@ -1513,6 +1513,9 @@ def evaluate(student: Student, update: Update, networks: dict[str, torch.Tensor]
     evaluation = {"env_id": args.env_id, "seeds": seeds}
     for name, vector in networks.items():
         update.vector.copy_(vector)
+        if name == "" and not args.capture_video and torch.equal(vector, networks["last_"]):
+            evaluation |= {mode: evaluation[f"last_{mode}"] for mode in ("sampled", "greedy")}
+            continue
         for mode in ("sampled", "greedy"):
             episodes = play_student(student, mode, args, seeds, keep=args.capture_video)
             returns = [float(episode["rewards"].sum()) for episode in episodes]
@@ -1808,7 +1811,7 @@ def main(args: Args) -> int:
     if is_atari(args.env_id):
         lives = [number for episode in human_episodes for number in rewards_per_life(episode)]
         human_summary["rewards_per_life"] = summary(lives)
-    finish_run(student, update, args, run_dir, epoch, training_seconds, best, human_summary, writer)
+    finish_run(student, update, args, run_dir, epoch, training_seconds, arithmetic, best, human_summary, writer)
     writer.close()
     return 0
 
@@ -1820,6 +1823,7 @@ def finish_run(
     run_dir: Path,
     epoch: int,
     seconds: float,
+    arithmetic: str,
     best: dict,
     human: dict,
     writer,
@@ -1854,6 +1858,7 @@ def finish_run(
             mode: {name: value for name, value in evaluation[mode].items() if name not in ("returns", "lives")}
             for mode in modes
         },
+        "arithmetic": arithmetic,
         "training_seconds": seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         / (1024 if sys.platform == "linux" else 1024**2),

@@ -670,7 +670,7 @@ class Learner:
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "dqn_gopher 2"
 FINISH = ("eval_episodes", "eval_epsilon", "capture_video", "save_model", "save_demos")
-FREE_ON_RESUME = {"run_dir", "resume", "stop_at", *FINISH}
+FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "num_threads", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
 
 
@@ -1122,11 +1122,11 @@ def main(args: Args) -> int:
         vars(means).update(checkpoint["means"])
         if not players.load_state_dict(checkpoint["players"]):
             print("--resume: a replayed episode differs (another machine?), goes on with it", file=sys.stderr)
-    arithmetic = f"{'bfloat16' if bf16 else 'float32'} on {device.type}"
+    threads = f"{args.num_threads} thread{'s' * (args.num_threads > 1)}"
+    arithmetic = f"{'bfloat16' if bf16 else 'float32'} on {device.type}, {threads}"
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
-        print(
-            f"--resume: was on {checkpoint['arithmetic']}, goes on on {arithmetic}: bytes will differ", file=sys.stderr
-        )
+        was = checkpoint["arithmetic"]
+        print(f"--resume: was {was}, goes on as {arithmetic}: bytes may differ", file=sys.stderr)
     greedy = greedy_policy(learner.agent, device)
     global_step = iteration * frames_per_step
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
@@ -1200,13 +1200,20 @@ def main(args: Args) -> int:
 
     progress.close()
     stop.release()
-    finish_run(learner.agent, args, run_dir, global_step, training_seconds, writer, device)
+    finish_run(learner.agent, args, run_dir, global_step, training_seconds, arithmetic, writer, device)
     writer.close()
     return 0
 
 
 def finish_run(
-    agent: AtariQNetwork, args: Args, run_dir: Path, global_step: int, seconds: float, writer, device: torch.device
+    agent: AtariQNetwork,
+    args: Args,
+    run_dir: Path,
+    global_step: int,
+    seconds: float,
+    arithmetic: str,
+    writer,
+    device: torch.device,
 ) -> None:
     """Evaluate, draw, save what was asked for, and write `result.json` last."""
     evaluation = evaluate(agent, args, run_dir, device)
@@ -1227,6 +1234,7 @@ def finish_run(
         "finish": {name: arguments(args)[name] for name in FINISH},
         "training": {"mode": "ε-greedy", **summary(read_episodes(run_dir)[-50:, 1])},
         "evaluation": evaluation,
+        "arithmetic": arithmetic,
         "training_seconds": seconds,
         "steps_per_second": global_step / seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

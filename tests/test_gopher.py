@@ -23,6 +23,7 @@ import torch
 from conftest import ROOT, assert_refused, command, edit_manifest, kill_twice, modified, rewrite, run
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation
+from scipy import stats
 
 from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_gopher as dqn
@@ -412,6 +413,14 @@ def test_a_lost_replay_buffer_is_not_taken_for_an_empty_one(tmp_path):
     assert "replay.dat" in done.stderr and done.stderr.count("\n") == 1
 
 
+def test_a_resume_may_take_other_threads(tmp_path):
+    run(*SMALL, "--stop-at", 8_000, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    done = run(*SMALL, "--num-threads", 2, "--run-dir", "run", "--resume", cwd=tmp_path, script=SCRIPT)
+    was = "--resume: was float32 on cpu, 1 thread, goes on as float32 on cpu, 2 threads: bytes may differ"
+    assert was in done.stderr
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["arithmetic"] == "float32 on cpu, 2 threads"
+
+
 def test_a_resume_with_other_hyperparameters_names_them(small, tmp_path, capsys):
     shutil.copytree(small, tmp_path / "run")
     flags = [*SMALL, "--gamma", 0.9, "--run-dir", tmp_path / "run", "--resume"]
@@ -503,7 +512,26 @@ def test_the_report_of_runs_from_the_memory(small, tmp_path):
     text = (tmp_path / "out" / "ram.md").read_text()
     assert "random play has 335" in text and f"| {score:.0f} ± 0 | {score / 335:.1f} |" in text.splitlines()[-1]
     assert (tmp_path / "out" / "ram.png").read_bytes()[1:4] == b"PNG"
-    assert "holds no finished run" in run("--runs", "out", cwd=tmp_path, script=script, code=1).stderr
+    assert "holds no finished run" in run("--runs", "out", cwd=tmp_path, script=script, code=2).stderr
+
+
+def test_trends_and_differences_of_scores():
+    """Straight lines seed by seed, against SciPy's; a difference from the DQN holds the error of its own score."""
+    sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
+    report = importlib.import_module("gopher_report")
+    rng = np.random.default_rng(0)
+    curve = {alpha: {seed: 20 + 5 * alpha + rng.normal() for seed in (1, 2, 3)} for alpha in (0.0, 0.2, 0.4, 0.6, 0.7)}
+    del curve[0.2][3]
+    alphas = [0.0, 0.2, 0.4, 0.6]
+    rises = [0.6 * stats.linregress(alphas, [curve[a][seed] for a in alphas]).slope for seed in (1, 2)]
+    half = stats.t.ppf(0.975, 1) * stats.sem(rises)
+    assert report.trend(curve, 0, 0.6) == f"{np.mean(rises):+.1f} ± {half:.1f}"
+    assert report.trend(curve, 0.6, 0.7) == ""  # two points are no line
+    first, second = {1: 40.0, 2: 40.0, 3: 40.0}, {2: 25.0, 3: 26.0, 4: 0.0}
+    spread = stats.t.ppf(0.975, 1) * stats.sem([15.0, 14.0])
+    assert report.less(first, second, 2.0) == f"+14.5 ± {np.hypot(spread, 1.96 * 2):.1f}"
+    teacher = [{"kind": "teacher", "mode": "greedy", "unit": report.LIVES, "std": 30.0, "scores": 900}]
+    assert report.own_error(teacher) == pytest.approx(1)
 
 
 def test_the_teacher_s_curve_is_the_moving_mean_of_its_episodes(tmp_path):
