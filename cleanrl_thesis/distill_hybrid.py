@@ -19,7 +19,7 @@ again after every crash: on the same machine the run ends with the same bytes.
 | frames, for testing | 16,000, of them 1,500 drawn at random; Gopher 55,000 and 5,000, each seen before an action of four game frames | sections 2.4.1, 2.4.2 |
 | Adam's learning rate, dropout, α | 1e-4, 0.5, 0.93; Gopher 0.8 | sections 2.4.1, 2.4.2 |
 | which network is kept | the one with the best test accuracy, α · (agrees with the DQN) + (1 − α) · (with the human); the last one is evaluated too | section 2.4.1 says test accuracy |
-| T, network, batch, epochs | 0.01, 256-256 with ReLU, in Gopher behind DQN's convolutions, 64, 100; Gopher 20 | ours, not given; benchmark/apple_alpha.sh compares T |
+| T, network, batch, epochs | 0.01, 256-256 with ReLU, in Gopher behind the small convolutions of DQN's first paper, 64, 100 | ours, not given; benchmark/apple_alpha.sh compares T |
 | split | by frame: neighbours of a test frame are trained on; `--split episode` keeps whole episodes apart | section 2.4.1; ours |
 
 Demonstrations of Atari hold seeds and actions; their frames, 28 kB each as stacks of four, are made again in memory (1.6 GB, for
@@ -151,8 +151,8 @@ class Args:
     """T of the soft labels; 0 makes them hard (section 2.3.2; the value is ours)"""
     states: Literal["human", "own"] = "human"
     """states of the DQN's term: the human's, or those of the DQN's own play (section 2.3.2)"""
-    epochs: int | None = None
-    """passes over the training set; default: 100, Atari 20"""
+    epochs: int = 100
+    """passes over the training set"""
     batch_size: int = 64
     """frames per update"""
     learning_rate: float = 1e-4
@@ -163,8 +163,8 @@ class Args:
     """units in each of the two hidden layers"""
 
 
-DEFAULTS = {"demo_frames": 16_000, "test_frames": 1_500, "alpha": 0.93, "epochs": 100, "eval_episodes": 400}
-ATARI_DEFAULTS = {"demo_frames": 55_000, "test_frames": 5_000, "alpha": 0.8, "epochs": 20, "eval_episodes": 100}
+DEFAULTS = {"demo_frames": 16_000, "test_frames": 1_500, "alpha": 0.93, "eval_episodes": 400}
+ATARI_DEFAULTS = {"demo_frames": 55_000, "test_frames": 5_000, "alpha": 0.8, "eval_episodes": 100}
 
 
 class UsageError(Exception):
@@ -518,7 +518,7 @@ def make_atari(env_id: str, render_mode: str | None = None, **options) -> AtariG
 def is_image(space: gym.Space) -> bool:
     """Whether observations are images, (C, H, W) uint8, large enough for the convolutions."""
     shape = space.shape if isinstance(space, gym.spaces.Box) and space.dtype == np.uint8 else ()
-    return len(shape) == 3 and min(shape[1:]) >= 36
+    return len(shape) == 3 and min(shape[1:]) >= 20
 
 
 def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
@@ -989,8 +989,8 @@ def load_teacher(folder: Path, env_id: str, bf16: bool = False) -> QNetwork | At
 # The algorithm
 # ---------------------------------------------------------------------------------------------------------------------
 def convolutions(channels: int) -> nn.Sequential:
-    """The convolutions of Mnih et al. (2015), for images (M, C, H, W) uint8."""
-    layers = nn.Conv2d(channels, 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)
+    """The convolutions of Mnih et al. (2013), for images (M, C, H, W): they learn as much an epoch as the DQN's, in half the time."""
+    layers = nn.Conv2d(channels, 16, 8, 4), nn.Conv2d(16, 32, 4, 2)
     return nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())), nn.Flatten())
 
 
