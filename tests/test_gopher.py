@@ -303,7 +303,17 @@ def test_a_torn_checkpoint_goes_on_from_the_one_before(small, tmp_path):
 
 def test_schedules_of_a_run(tmp_path):
     """ε falls to --end-e over its share of the frames, the learning rate to 0 over all."""
-    flags = [*RAM, "--total-timesteps", 40_000, "--learning-starts", 32_000, "--anneal-lr", "--exploration-fraction", 0.5, "--no-double"]
+    flags = [
+        *RAM,
+        "--total-timesteps",
+        40_000,
+        "--learning-starts",
+        32_000,
+        "--anneal-lr",
+        "--exploration-fraction",
+        0.5,
+        "--no-double",
+    ]
     run(*flags, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
     updates = np.genfromtxt(tmp_path / "run" / "updates.csv", delimiter=",", names=True, deletechars="")
     frames = updates["global_step"] - 32  # of the step before, which was taken with them
@@ -390,7 +400,18 @@ def test_copied_alone_into_an_empty_folder(small, tmp_path):
 
 def test_a_video_is_the_first_evaluation_episode(tmp_path):
     """As long as that episode, a picture of each of its steps and of its beginning."""
-    flags = [*RAM, "--total-timesteps", 3_200, "--learning-starts", 1_600, "--noop-max", 0, "--capture-video", "--run-dir", "run"]
+    flags = [
+        *RAM,
+        "--total-timesteps",
+        3_200,
+        "--learning-starts",
+        1_600,
+        "--noop-max",
+        0,
+        "--capture-video",
+        "--run-dir",
+        "run",
+    ]
     run(*flags, cwd=tmp_path, script=SCRIPT)
     (path,) = (tmp_path / "run" / "videos").glob("*.mp4")
     evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
