@@ -3,9 +3,9 @@
     python benchmark/dreamer_report.py                              # runs/dreamer_xs -> benchmark/results/dreamer/xs
     python benchmark/dreamer_report.py --known DIR                  # with the runs of an earlier report whose folders are gone
 
-Runs that go on are in the figures, as far as the shortest of an agent's has come, and not yet in its table. Steps are counted from the first update, after
-the random play of `--prefill`, whose episodes are in no mean. A run has come to a return when the mean of its last 200 episodes is
-as high; near 0.5 these span some 10,000 steps. Intervals are 95% t-intervals over seeds.
+Runs that go on are in the figures, as far as the shortest of an agent's has come, and not yet in its table. Steps are counted
+from the first update, after the random play of `--prefill`, whose episodes are in no mean. A run has come to a return when the
+mean of its last 200 episodes is as high; near 0.5 these span some 10,000 steps. Intervals are 95% t-intervals over seeds.
 """
 
 import csv

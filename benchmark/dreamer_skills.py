@@ -30,7 +30,7 @@ from dreamer_true import CELLS, LOOKS, Rooms, check_updates
 from cleanrl_thesis import hwm_hrl_dreamer as hrl
 
 PLACES = 8  # four rooms, four doors
-SWEEPS = 4  # over the places, until none of them takes another skill
+SWEEPS = 4  # over the places
 VIEWS = {"both": "w, z, e | w, z, e", "critic": "w, e | w, z, e", "neither": "w, e | w, e"}  # what π^L and V^L see
 
 
@@ -169,9 +169,7 @@ class Tables:
         for place in range(PLACES):
             inside = np.flatnonzero(rooms == place)
             beside = np.abs(cells[:, None] - cells[inside]).sum(-1).min(1) == 1
-            exits = np.flatnonzero(
-                beside & (rooms != place)
-            )  # a room's two doors, or the cells on both sides of a door
+            exits = np.flatnonzero(beside & (rooms != place))  # two doors, or the cells on both sides of a door
             chosen = ways(moves, inside, exits[[e % 2]]) if place >= 4 or e < 2 else self.round(inside, e % 4)
             actions = np.where(np.isin(np.arange(len(moves)) // 4, inside), chosen, actions)
         return actions

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Gopher: a teacher from 10,010,000 frames of pixels, and students of it and of the synthetic human over α, and over T at
 # two α; the runs behind benchmark/results/gopher/. Can be sent again after every stop. By benchmark/results/speed/gopher.md
-# the teacher takes about 3 hours of a core with bfloat16, without 8 to 12; its replay takes 8 GB of disk. A student takes about an hour.
+# the teacher takes about 3 hours of a core with bfloat16, several times as long without; its replay takes 8 GB.
 #   benchmark/gopher_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
 #   THREADS=2 benchmark/gopher_alpha.sh     the teacher with two threads

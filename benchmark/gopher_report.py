@@ -2,9 +2,10 @@
 
     python benchmark/gopher_report.py        # runs/gopher -> benchmark/results/gopher
 
-Takes whatever part of the runs of `benchmark/gopher_alpha.sh` is done. Scores are the number of rewards in each life, the unit
-in which Table 2.2 seems to count (benchmark/results/README.md), and in `runs.csv` also the points of a game. Intervals are 95% t-intervals
-of the seeds' means; a seed has its own human and student, but all students have the same DQN, whose own spread is in no interval.
+Takes whatever part of the runs of `benchmark/gopher_alpha.sh` is done. Scores are the number of rewards in each life, the unit in
+which Table 2.2 seems to count (benchmark/results/README.md), and in `runs.csv` also the points of a game. Intervals are 95%
+t-intervals of the seeds' means. A seed has its own human and student, but all students have the same DQN; differences from it hold
+the error of its own score.
 """
 
 import json

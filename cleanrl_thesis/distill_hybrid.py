@@ -989,7 +989,7 @@ def load_teacher(folder: Path, env_id: str, bf16: bool = False) -> QNetwork | At
 # The algorithm
 # ---------------------------------------------------------------------------------------------------------------------
 def convolutions(channels: int) -> nn.Sequential:
-    """The convolutions of Mnih et al. (2013), for images (M, C, H, W): they learn as much an epoch as the DQN's, in half the time."""
+    """The convolutions of Mnih et al. (2013), smaller than the DQN's, for images (M, C, H, W)."""
     layers = nn.Conv2d(channels, 16, 8, 4), nn.Conv2d(16, 32, 4, 2)
     return nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())), nn.Flatten())
 
@@ -1184,7 +1184,7 @@ def measure(student: Student, data: Data, args: Args) -> dict[str, float]:
 # ---------------------------------------------------------------------------------------------------------------------
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
-CHECKPOINT_FORMAT = "distill_hybrid 1"
+CHECKPOINT_FORMAT = "distill_hybrid 2"
 FINISH = ("eval_episodes", "eval_mode", "capture_video", "save_model", "save_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -1508,6 +1508,7 @@ def evaluate(student: Student, update: Update, networks: dict[str, torch.Tensor]
     """Play `--eval-episodes` episodes with each network in each mode; write `evaluation.json` and, if asked, a video.
 
     `networks` are vectors of parameters by what is put before the mode's name; the student is left with the last.
+    Where both are the same network, it plays once.
     """
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
     evaluation = {"env_id": args.env_id, "seeds": seeds}
