@@ -33,6 +33,6 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
       for seed in $SEEDS; do student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"; done
     done
   done
-} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 \
+} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --compile \
   --save-model --resume
 "$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT"

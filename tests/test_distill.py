@@ -75,12 +75,14 @@ def test_dropout_masks_keep_the_mean():
     assert abs(masks.mean().item() - 1) < 0.01
 
 
-def make_update(**settings):
+def make_update(images: bool = False, **settings):
     args = distill.complete_args(distill.Args(teacher=".", hidden_size=32, **settings))
     torch.manual_seed(0)
-    student = distill.Student((6,), 9, 32)
     generator = torch.Generator().manual_seed(1)
     rl_obs, he_obs = torch.rand(2, 64, 6, generator=generator)
+    if images:
+        rl_obs, he_obs = torch.randint(256, (2, 64, 4, 84, 84), dtype=torch.uint8, generator=generator)
+    student = distill.Student(tuple(he_obs.shape[1:]), 9, 32)
     labels = torch.softmax(torch.randn(64, 9, generator=generator), 1)
     data = distill.Data(rl_obs, labels, he_obs, torch.randint(9, (64,), generator=generator))
     if args.states == "human":
@@ -113,8 +115,9 @@ def test_update_is_torchs_adam_on_the_loss(states):
 
 
 @needs_compiler
-def test_compiled_update_is_the_plain_one():
-    (_, plain, data, _), (_, compiled, _, _) = make_update(), make_update(compile=True)
+@pytest.mark.parametrize("images", [False, True])
+def test_compiled_update_is_the_plain_one(images):
+    (_, plain, data, _), (_, compiled, _, _) = make_update(images), make_update(images, compile=True)
     assert compiled.is_compiled and not plain.is_compiled
     for _ in range(20):
         masks = distill.draw_masks((2, 64, 32), 0.5)
