@@ -56,6 +56,7 @@ import json
 import math
 import os
 import platform
+import re
 import resource
 import shutil
 import signal
@@ -271,7 +272,7 @@ def complete_args(args: Args) -> Args:
     for name, value in SIZES[args.size].items():
         setattr(args, name, value if getattr(args, name) is None else getattr(args, name))
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
-    counts = "num_threads num_envs eval_episodes checkpoint_interval stop_at train_frequency batch_size starts horizon"
+    counts = "num_envs eval_episodes checkpoint_interval stop_at train_frequency batch_size starts horizon"
     counts += " depth deter stoch hidden_size head_size head_layers slow_interval"
     rates = "model_learning_rate actor_learning_rate critic_learning_rate adam_eps image_scale"
     scales = "kl_scale entropy_scale reward_scale discount_scale ent_coef weight_decay"
@@ -284,6 +285,8 @@ def complete_args(args: Args) -> Args:
         ("gamma gae_lambda kl_balance rewarded_share", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("kl_warmup", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
+        ("num_threads", lambda x: 1 <= x <= 1024, "must be between 1 and 1024"),
+        ("exp_name", lambda x: re.fullmatch(r"[\w.-]+", x), "must be of letters, digits and the signs _ . -"),
         ("prefill total_timesteps", lambda x: x >= BLOCK and x % BLOCK == 0, f"must be a multiple of {BLOCK}"),
     ):
         for name in names.split():
@@ -1285,6 +1288,7 @@ class Collector:
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "dreamer_v2 1"
+SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("eval_episodes", "capture_video", "save_model")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -1382,7 +1386,7 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if all(path.suffix == ".tmp" for path in run_dir.iterdir()):
+        if all(path.suffix == ".tmp" or path.name in ("args.json", "wandb") for path in run_dir.iterdir()):  # not begun
             write_json(run_dir / "args.json", arguments(args))
             return run_dir, None
         require(args.resume, "--run-dir", run_dir, "exists; give --resume to go on in it, or another folder")
@@ -1420,7 +1424,7 @@ class CsvLog:
     def __init__(self, path: Path, length: int):
         self.file = open(path, "a", newline="", buffering=1)  # noqa: SIM115
         if path.stat().st_size < length:
-            raise RunError(f"{path}: shorter than at the last checkpoint; it cannot be gone on with")
+            raise RunError(f"{path}: shorter than at the last checkpoint; the run cannot be resumed")
         self.file.truncate(length)
         self.file.seek(0, os.SEEK_END)
         self.writer, self.has_header = csv.writer(self.file, lineterminator="\n"), length > 0
@@ -1720,10 +1724,12 @@ def main(args: Args) -> int:
     if is_done(run_dir, args, last_step):
         print(f"{run_dir} is done")
         return 0
-    done_without = checkpoint is None and (run_dir / "result.json").exists()
-    require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
+    lost = checkpoint is None and (run_dir / "result.json").exists()
+    require(not lost, "--resume", run_dir, "was finished with other flags, and its checkpoint is gone")
     write_json(run_dir / "args.json", arguments(args))
     print(run_dir)
+    if args.track:
+        start_wandb(args, run_dir)
 
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
@@ -1760,8 +1766,6 @@ def main(args: Args) -> int:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
-    if args.track:
-        start_wandb(args, run_dir)
     forget_end(run_dir, global_step < last_step)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_step, initial=global_step, unit="step", disable=None)
@@ -1843,7 +1847,7 @@ def finish_run(learner: Learner, args: Args, run_dir: Path, global_step: int, se
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
-        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
+        "script_sha256": SCRIPT_SHA256,
     }
     write_json(run_dir / "result.json", result)
     print_table(result)
@@ -1860,6 +1864,10 @@ def cli(argv: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
     except (OSError, MemoryError) as error:
         print(f"error: {error}; a checkpoint stays whole: go on with --run-dir and --resume", file=sys.stderr)
+    except RuntimeError as error:  # torch's own way to say that memory is short
+        if not isinstance(error, torch.OutOfMemoryError) and "allocate" not in str(error):
+            raise
+        print(f"error: not enough memory: {first_line(error)}", file=sys.stderr)
     return 1
 
 

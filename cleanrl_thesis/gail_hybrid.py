@@ -60,6 +60,7 @@ import math
 import os
 import platform
 import random
+import re
 import resource
 import signal
 import sys
@@ -237,7 +238,7 @@ def complete_args(args: Args) -> Args:
     args.stop_at = max(1, args.total_timesteps) if args.stop_at is None else args.stop_at
     if args.frame_skip is None:
         args.frame_skip = 5 if is_driving(args.env_id) else 1
-    counts = "num_threads num_envs eval_episodes checkpoint_interval stop_at human_episodes hidden_size"
+    counts = "num_envs eval_episodes checkpoint_interval stop_at human_episodes hidden_size"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         (
@@ -250,6 +251,8 @@ def complete_args(args: Args) -> Args:
         ("cg_damping ent_coef d_ent_coef d_grad_penalty", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
         ("alpha gamma gae_lambda", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
+        ("num_threads", lambda x: 1 <= x <= 1024, "must be between 1 and 1024"),
+        ("exp_name", lambda x: re.fullmatch(r"[\w.-]+", x), "must be of letters, digits and the signs _ . -"),
         ("save_demos bc_epochs", lambda x: x >= 0, "must be at least 0"),
     ):
         for name in names.split():
@@ -1529,6 +1532,7 @@ def update_discriminator(
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "gail_hybrid 1"
+SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("eval_episodes", "eval_mode", "capture_video", "save_model", "save_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -1619,7 +1623,7 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if all(path.suffix == ".tmp" for path in run_dir.iterdir()):
+        if all(path.suffix == ".tmp" or path.name in ("args.json", "wandb") for path in run_dir.iterdir()):  # not begun
             write_json(run_dir / "args.json", arguments(args))
             return run_dir, None
         require(args.resume, "--run-dir", run_dir, "exists; give --resume to go on in it, or another folder")
@@ -1665,7 +1669,7 @@ class CsvLog:
     def __init__(self, path: Path, length: int):
         self.file = open(path, "a", newline="", buffering=1)  # noqa: SIM115
         if path.stat().st_size < length:
-            raise RunError(f"{path}: shorter than at the last checkpoint; it cannot be gone on with")
+            raise RunError(f"{path}: shorter than at the last checkpoint; the run cannot be resumed")
         self.file.truncate(length)
         self.file.seek(0, os.SEEK_END)
         self.writer, self.has_header = csv.writer(self.file, lineterminator="\n"), length > 0
@@ -2002,16 +2006,18 @@ def main(args: Args) -> int:
     if is_done(run_dir, args, last_iteration * args.batch_size):
         print(f"{run_dir} is done")
         return 0
-    done_without = checkpoint is None and (run_dir / "result.json").exists()
-    require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
+    lost = checkpoint is None and (run_dir / "result.json").exists()
+    require(not lost, "--resume", run_dir, "was finished with other flags, and its checkpoint is gone")
     write_json(run_dir / "args.json", arguments(args))
     print(run_dir)
+    if args.track:
+        start_wandb(args, run_dir)
     if human and args.demos_human is None:
         about = {"env_id": args.env_id, "options": env_options(args), "player": "synthetic human", "mode": "scripted"}
         write_demonstrations(run_dir / "demos_synthetic_human", human, about)
     del human, rl  # the arrays are in `experts` now
 
-    random.seed(args.seed)  # this file draws from neither; for environments that do
+    random.seed(args.seed)  # this file draws from neither; of environments that do, resumed runs end with other bytes
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
@@ -2055,8 +2061,6 @@ def main(args: Args) -> int:
     global_step = iteration * args.batch_size
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
-    if args.track:
-        start_wandb(args, run_dir)
     forget_end(run_dir, iteration < last_iteration)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * args.batch_size, initial=global_step, unit="step", disable=None)
@@ -2160,7 +2164,7 @@ def finish_run(
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
-        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
+        "script_sha256": SCRIPT_SHA256,
     }
     write_json(run_dir / "result.json", result)
     print_table(result)
@@ -2177,6 +2181,10 @@ def cli(argv: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
     except (OSError, MemoryError) as error:
         print(f"error: {error}; a checkpoint stays whole: go on with --run-dir and --resume", file=sys.stderr)
+    except RuntimeError as error:  # torch's own way to say that memory is short
+        if not isinstance(error, torch.OutOfMemoryError) and "allocate" not in str(error):
+            raise
+        print(f"error: not enough memory: {first_line(error)}", file=sys.stderr)
     return 1
 
 

@@ -51,6 +51,7 @@ import json
 import math
 import os
 import platform
+import re
 import resource
 import shutil
 import signal
@@ -238,7 +239,7 @@ def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.attempts * args.total_updates if args.stop_at is None else args.stop_at
     args.budget_updates = math.ceil(0.8 * args.total_updates) if args.budget_updates is None else args.budget_updates
-    counts = "num_threads checkpoint_interval attempts stop_at train_pairs heldout_episodes total_updates batch_size hidden_size"
+    counts = "checkpoint_interval attempts stop_at train_pairs heldout_episodes total_updates batch_size hidden_size"
     counts += " deter_z stoch_z deter_w stoch_w budget_updates surprise_updates"
     scales = "kl_z_scale kl_w_scale kl_m_scale read_price budget_price surprise_price foretell_copies boundary_bound"
     for names, holds, allowed in (
@@ -253,6 +254,8 @@ def complete_args(args: Args) -> Args:
         ("temperature", lambda x: 0 < x <= 1, "must be greater than 0 and at most 1"),
         ("max_segment_length max_segments", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
+        ("num_threads", lambda x: 1 <= x <= 1024, "must be between 1 and 1024"),
+        ("exp_name", lambda x: re.fullmatch(r"[\w.-]+", x), "must be of letters, digits and the signs _ . -"),
     ):
         for name in names.split():
             require(holds(getattr(args, name)), f"--{name.replace('_', '-')}", getattr(args, name), allowed)
@@ -902,6 +905,7 @@ def compile_step(model: HWM, data: Sequence, args: Args) -> bool:
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "hwm_segment 3"
+SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("save_model", "heldout_episodes", "heldout_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", "demos", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -991,7 +995,7 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if all(path.suffix == ".tmp" for path in run_dir.iterdir()):
+        if all(path.suffix == ".tmp" or path.name in ("args.json", "wandb") for path in run_dir.iterdir()):  # not begun
             write_json(run_dir / "args.json", arguments(args))
             return run_dir, None
         require(args.resume, "--run-dir", run_dir, "exists; give --resume to go on in it, or another folder")
@@ -1029,7 +1033,7 @@ class CsvLog:
     def __init__(self, path: Path, length: int):
         self.file = open(path, "a", newline="", buffering=1)  # noqa: SIM115
         if path.stat().st_size < length:
-            raise RunError(f"{path}: shorter than at the last checkpoint; it cannot be gone on with")
+            raise RunError(f"{path}: shorter than at the last checkpoint; the run cannot be resumed")
         self.file.truncate(length)
         self.file.seek(0, os.SEEK_END)
         self.writer, self.has_header = csv.writer(self.file, lineterminator="\n"), length > 0
@@ -1262,10 +1266,12 @@ def main(args: Args) -> int:
     if is_done(run_dir, args, last_update):
         print(f"{run_dir} is done")
         return 0
-    done_without = checkpoint is None and (run_dir / "result.json").exists()
-    require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
+    lost = checkpoint is None and (run_dir / "result.json").exists()
+    require(not lost, "--resume", run_dir, "was finished with other flags, and its checkpoint is gone")
     write_json(run_dir / "args.json", arguments(args))
     print(run_dir)
+    if args.track:
+        start_wandb(args, run_dir)
 
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
@@ -1293,8 +1299,6 @@ def main(args: Args) -> int:
     if checkpoint and update < last_update and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     updates_csv = CsvLog(run_dir / "updates.csv", offset)
-    if args.track:
-        start_wandb(args, run_dir)
     forget_end(run_dir, update < last_update)
     writer = SummaryWriter(str(run_dir), purge_step=update + 1)
     progress = tqdm(total=last_update, initial=update, unit="update", disable=None)
@@ -1387,7 +1391,7 @@ def finish_run(
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
-        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
+        "script_sha256": SCRIPT_SHA256,
     }
     write_json(run_dir / "result.json", result)
     print_table(segmentation)
@@ -1404,6 +1408,10 @@ def cli(argv: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
     except (OSError, MemoryError) as error:
         print(f"error: {error}; a checkpoint stays whole: go on with --run-dir and --resume", file=sys.stderr)
+    except RuntimeError as error:  # torch's own way to say that memory is short
+        if not isinstance(error, torch.OutOfMemoryError) and "allocate" not in str(error):
+            raise
+        print(f"error: not enough memory: {first_line(error)}", file=sys.stderr)
     return 1
 
 

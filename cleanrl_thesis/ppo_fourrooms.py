@@ -43,6 +43,7 @@ import json
 import math
 import os
 import platform
+import re
 import resource
 import shutil
 import signal
@@ -194,7 +195,7 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
-    counts = "num_threads num_envs num_steps num_minibatches update_epochs eval_episodes checkpoint_interval stop_at"
+    counts = "num_envs num_steps num_minibatches update_epochs eval_episodes checkpoint_interval stop_at"
     counts += " channels hidden_size"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
@@ -203,6 +204,8 @@ def complete_args(args: Args) -> Args:
         ("ent_coef vf_coef", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
         ("gamma gae_lambda", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
+        ("num_threads", lambda x: 1 <= x <= 1024, "must be between 1 and 1024"),
+        ("exp_name", lambda x: re.fullmatch(r"[\w.-]+", x), "must be of letters, digits and the signs _ . -"),
         ("save_demos", lambda x: x >= 0, "must be at least 0"),
         ("demo_noise", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
     ):
@@ -766,6 +769,7 @@ def update_agent(update: Update, batch: Batch, args: Args) -> dict[str, float]:
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
 CHECKPOINT_FORMAT = "ppo_fourrooms 2"
+SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("eval_episodes", "capture_video", "save_model", "save_demos", "demo_mode", "demo_noise")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
@@ -855,7 +859,7 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         fcntl.flock(os.open(run_dir, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if all(path.suffix == ".tmp" for path in run_dir.iterdir()):
+        if all(path.suffix == ".tmp" or path.name in ("args.json", "wandb") for path in run_dir.iterdir()):  # not begun
             write_json(run_dir / "args.json", arguments(args))
             return run_dir, None
         require(args.resume, "--run-dir", run_dir, "exists; give --resume to go on in it, or another folder")
@@ -893,7 +897,7 @@ class CsvLog:
     def __init__(self, path: Path, length: int):
         self.file = open(path, "a", newline="", buffering=1)  # noqa: SIM115
         if path.stat().st_size < length:
-            raise RunError(f"{path}: shorter than at the last checkpoint; it cannot be gone on with")
+            raise RunError(f"{path}: shorter than at the last checkpoint; the run cannot be resumed")
         self.file.truncate(length)
         self.file.seek(0, os.SEEK_END)
         self.writer, self.has_header = csv.writer(self.file, lineterminator="\n"), length > 0
@@ -1153,10 +1157,12 @@ def main(args: Args) -> int:
     reached = 0 if checkpoint is None else checkpoint["iteration"]
     is_behind = reached <= last_iteration  # or the demonstrations would be another player's
     require(is_behind, "--stop-at", args.stop_at, f"{run_dir} is at step {reached * args.batch_size} already")
-    done_without = checkpoint is None and (run_dir / "result.json").exists()
-    require(not done_without, "--resume", run_dir, "was finished otherwise, and has no checkpoint to go on from")
+    lost = checkpoint is None and (run_dir / "result.json").exists()
+    require(not lost, "--resume", run_dir, "was finished with other flags, and its checkpoint is gone")
     write_json(run_dir / "args.json", arguments(args))
     print(run_dir)
+    if args.track:
+        start_wandb(args, run_dir)
 
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
@@ -1188,8 +1194,6 @@ def main(args: Args) -> int:
     global_step = iteration * args.batch_size
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])
     updates_csv = CsvLog(run_dir / "updates.csv", offsets["updates"])
-    if args.track:
-        start_wandb(args, run_dir)
     forget_end(run_dir, iteration < last_iteration)
     writer = SummaryWriter(str(run_dir), purge_step=global_step + 1)
     progress = tqdm(total=last_iteration * args.batch_size, initial=global_step, unit="step", disable=None)
@@ -1272,7 +1276,7 @@ def finish_run(agent: Agent, args: Args, run_dir: Path, global_step: int, second
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         / (1024 if sys.platform == "linux" else 1024**2),
         "versions": {**versions, "python": platform.python_version()},
-        "script_sha256": hashlib.sha256(Path(__file__).read_bytes()).hexdigest(),
+        "script_sha256": SCRIPT_SHA256,
     }
     write_json(run_dir / "result.json", result)
     print_table(result)
@@ -1289,6 +1293,10 @@ def cli(argv: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
     except (OSError, MemoryError) as error:
         print(f"error: {error}; a checkpoint stays whole: go on with --run-dir and --resume", file=sys.stderr)
+    except RuntimeError as error:  # torch's own way to say that memory is short
+        if not isinstance(error, torch.OutOfMemoryError) and "allocate" not in str(error):
+            raise
+        print(f"error: not enough memory: {first_line(error)}", file=sys.stderr)
     return 1
 
 
