@@ -1425,6 +1425,7 @@ class Update:
 CHECKPOINT_FORMAT = "ddpg_torcs_like 2"
 SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("eval_episodes", "capture_video", "save_model", "save_demos")
+# not checkpoint_interval: the size of replay.dat follows from it
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
 
@@ -1867,8 +1868,9 @@ def main(args: Args) -> int:
     env = make_env(args.env_id, **env_options(args))
     if args.capture_video:
         check_video(args.env_id)
-    row = 4 * (2 * env.observation_space.shape[0] + env.action_space.shape[0] + 2)
-    check_disk(args, "--buffer-size", args.buffer_size, args.buffer_size * row)
+    spare = 2 * (min(max(args.checkpoint_interval, args.rollout_steps), args.total_timesteps) + args.rollout_steps)
+    row_bytes = 4 * (2 * env.observation_space.shape[0] + env.action_space.shape[0] + 2)
+    check_disk(args, "--buffer-size", args.buffer_size, (args.buffer_size + spare) * row_bytes)
     run_dir, checkpoint = open_run_dir(args)
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / args.rollout_steps))
     if is_done(run_dir, args, last_iteration * args.rollout_steps):
@@ -1899,7 +1901,6 @@ def main(args: Args) -> int:
     players = make_players(args)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
     explorer = (ParameterNoise if args.noise == "parameter" else ActionNoise)(optimizer, args, action_dim, rng)
-    spare = 2 * (min(max(args.checkpoint_interval, args.rollout_steps), args.total_timesteps) + args.rollout_steps)
     added, width = 0 if checkpoint is None else checkpoint["added"], 2 * obs_dim + action_dim + 2
     is_trained = checkpoint is not None and checkpoint["iteration"] >= last_iteration  # only its end is done again
     buffer = None if is_trained else ReplayBuffer(run_dir / "replay.dat", args.buffer_size, spare, width, added)

@@ -36,7 +36,7 @@ agent, and its score stands to the DDPG experts' as in Table 2.3. `--demos-human
 # /// script
 # requires-python = ">=3.11"
 # dependencies = [
-#     "gymnasium>=1.2",
+#     "gymnasium[mujoco]>=1.2",
 #     "matplotlib>=3.9",
 #     "numpy>=2.0",
 #     "pillow>=10.1",
@@ -1534,7 +1534,7 @@ def update_discriminator(
 CHECKPOINT_FORMAT = "gail_hybrid 1"
 SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("eval_episodes", "eval_mode", "capture_video", "save_model", "save_demos")
-FREE_ON_RESUME = {"run_dir", "resume", "stop_at", *FINISH}
+FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
 FREE_ON_RESUME |= {"demos_rl", "demos_human"}  # their data are compared, not their names
 

@@ -302,6 +302,14 @@ def test_a_resume_with_other_hyperparameters_names_them(student, expert, tmp_pat
     assert_refused(gail, capsys, flags, ["--gamma 0.9", "was"])
 
 
+def test_a_student_goes_on_with_other_checkpoints(student, expert, tmp_path):
+    """They are no part of the result: the same bytes, from an interval of 1 step and then of 1,000."""
+    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--run-dir", "run", "--resume"]
+    run(*flags, "--stop-at", 1_024, cwd=tmp_path, script=GAIL)
+    run(*flags, "--checkpoint-interval", 1_000, cwd=tmp_path, script=GAIL)
+    assert_same_run(student, tmp_path / "run")
+
+
 @pytest.mark.parametrize("steps", [512, 0])
 def test_a_resume_with_other_demonstrations_is_refused(steps, expert, tmp_path, monkeypatch, capsys):
     """Of a student, and of a clone, which has no checkpoint."""
@@ -375,6 +383,13 @@ def replayed(folder: Path, width: int) -> np.ndarray:
     """The transitions in the replay buffer of a run that has not gone round."""
     added = torch.load(folder / "checkpoint.pt", weights_only=True)["added"]
     return np.fromfile(folder / "replay.dat", np.float32).reshape(-1, width)[:added]
+
+
+def test_the_replay_file_is_as_large_as_the_disk_was_asked_for(tmp_path, monkeypatch):
+    asked, check = [], ddpg.check_disk
+    monkeypatch.setattr(ddpg, "check_disk", lambda *its: asked.append(its[3]) or check(*its))
+    run(*SMALL_DDPG, "--total-timesteps", 200, "--run-dir", "run", cwd=tmp_path, script=DDPG)
+    assert asked == [(tmp_path / "run" / "replay.dat").stat().st_size]
 
 
 def test_what_is_replayed(expert, tmp_path):
