@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import math
 
 import gymnasium as gym
@@ -184,6 +185,45 @@ def test_a_time_out_is_bootstrapped_with_the_value_of_the_final_observation():
     assert torch.equal(advantages[True][t + 1 :], advantages[False][t + 1 :])
 
 
+@pytest.mark.parametrize("flags", [{}, {"norm_adv_scope": "batch"}, {"norm_adv_scope": "batch", "norm_adv": False}])
+def test_a_batch_by_hand(flags):
+    """Every column, step by step and environment by environment: two of these, three steps, an end and a time-out."""
+    args = make_args(num_envs=2, num_steps=3, num_minibatches=1, bootstrap_truncated=True, gae_lambda=0.8, **flags)
+    agent, rng = make_agent(args), np.random.default_rng(0)
+    with torch.no_grad():
+        agent.actor_logstd.copy_(torch.tensor([0.5, -0.2, 0.1]))
+    obs, actions, rewards, last = (
+        rng.standard_normal(shape).astype(np.float32) for shape in [(4, 2, O), (3, 2, A), (3, 2), (O,)]
+    )
+    dones = np.array([[0, 1], [1, 0], [0, 0]], np.float32)
+    rollout = ppo.Rollout(obs, actions, rewards.copy(), dones, [(0, 1, last)], [])
+    batch = ppo.make_batch(agent, rollout, args, CPU)
+    value = {(t, i): agent.critic(torch.from_numpy(obs[t, i])).item() for t in range(4) for i in range(2)}
+    expected = np.zeros((3, 2))
+    for i in range(2):
+        following = 0.0
+        for t in reversed(range(3)):
+            reward = rewards[t, i] + (
+                args.gamma * agent.critic(torch.from_numpy(last)).item() if (t, i) == (0, 1) else 0
+            )
+            delta = reward + args.gamma * value[t + 1, i] * (1 - dones[t, i]) - value[t, i]
+            following = expected[t, i] = delta + args.gamma * 0.8 * following * (1 - dones[t, i])
+    scaled = expected.ravel()
+    if flags.get("norm_adv", True) and args.norm_adv_scope == "batch":
+        scaled = (scaled - scaled.mean()) / scaled.std(ddof=1)
+    places = [(t, i) for t in range(3) for i in range(2)]
+    for row, (t, i) in enumerate(places):
+        mean = agent.actor_mean(torch.from_numpy(obs[t, i]))
+        logprob = Independent(Normal(mean, agent.actor_logstd.exp()), 1).log_prob(torch.from_numpy(actions[t, i]))
+        assert np.array_equal(batch.obs[row], obs[t, i]) and np.array_equal(batch.actions[row], actions[t, i])
+        assert torch.allclose(batch.means[row], mean, atol=1e-6)
+        assert batch.logprobs[row].item() == pytest.approx(logprob.item(), abs=1e-5)
+        assert batch.advantages[row].item() == pytest.approx(scaled[row], abs=1e-5)
+        assert batch.returns[row].item() == pytest.approx(expected[t, i] + value[t, i], abs=1e-5)
+        assert batch.values[row].item() == pytest.approx(value[t, i], abs=1e-6)
+    assert {len(column) for column in batch} == {6}
+
+
 @pytest.mark.parametrize("clip_vloss", [True, False])
 @pytest.mark.parametrize("norm_adv", [True, False])
 def test_loss_is_the_one_derived_by_hand(clip_vloss, norm_adv):
@@ -331,6 +371,18 @@ def test_every_flag_changes_the_training(flags):
     assert any(not torch.equal(p, q) for p, q in zip(default.parameters(), changed.parameters()))
 
 
+def test_each_iteration_takes_the_batch_in_another_order(monkeypatch):
+    """All of it, each row once; so not the order of time, and not the same one again."""
+    rows, batches, make_batch = [], [], ppo.make_batch
+    monkeypatch.setattr(ppo, "make_batch", lambda *its: batches.append(make_batch(*its)) or batches[-1])
+    iterate(make_args(update_epochs=3), lambda update: lambda its: rows.append(its.clone()) or update(its))
+    assert [len(minibatch) for minibatch in rows] == [32] * 12
+    orders = [[row.tobytes() for row in its.numpy()] for its in (batches[0].pack(), *torch.cat(rows).split(128))]
+    assert len(orders) == 4 and len(set(orders[0])) == 128
+    assert all(sorted(order) == sorted(orders[0]) for order in orders)
+    assert len({tuple(order) for order in orders}) == 4
+
+
 def script_divergence(monkeypatch, values: list[float], estimator: str = "k1") -> list[int]:
     """Let the measured divergence be `values`, under one estimator's name; returns the list that counts its samples."""
     samples = []
@@ -457,12 +509,18 @@ def test_gpu_gives_the_numbers_of_the_cpu():
 
 
 def test_ends_time_outs_returns_and_noise_of_a_rollout():
-    """Both end an episode, a time-out alone has a last observation; returns are raw; noise has the policy's deviation."""
+    """Both end an episode, a time-out alone has a last observation; returns are raw; noise has the policy's deviation.
+
+    Actions are those that were drawn, also beyond the bounds within which the environment gets them.
+    """
     args = make_args(num_steps=16, total_timesteps=160, norm_divisor="variance")
     agent = make_agent(args, 1, 1)
     with torch.no_grad():
-        agent.actor_logstd.fill_(-1.0)
-    collector = ppo.Collector([Counter()], args)
+        agent.actor_logstd.fill_(1.0)
+    env, taken = Counter(), []
+    step = env.step
+    env.step = lambda action: taken.append(action) or step(action)
+    collector = ppo.Collector([env], args)
     collector.start()
     rollout = collector.collect(agent)
     assert np.flatnonzero(rollout.dones[:, 0]).tolist() == [3, 7, 11, 15]
@@ -471,7 +529,43 @@ def test_ends_time_outs_returns_and_noise_of_a_rollout():
     noise = np.random.default_rng(np.random.SeedSequence(args.seed)).standard_normal((16, 1, 1), np.float32)
     with torch.no_grad():
         mean = agent.actor_mean(torch.from_numpy(rollout.obs[:16])).numpy()
-    assert np.allclose((rollout.actions - mean) / math.exp(-1), noise, atol=1e-4)
+    assert np.allclose((rollout.actions - mean) / math.exp(1), noise, atol=1e-4)
+    assert np.abs(rollout.actions).max() > 2 and np.array_equal(np.clip(rollout.actions[:, 0], -1, 1), taken)
     collector.update_agent_statistics(agent)
     assert np.allclose(agent.obs_divisor, collector.obs_stats.divisor("variance"))
     assert np.allclose(agent.obs_mean, collector.obs_stats.mean)
+
+
+def test_evaluation_and_demonstrations_play_in_the_mode_that_is_asked_for(tmp_path):
+    """Greedy the mean of normalised observations, sampled with the policy's deviation around it; both within bounds."""
+    agent = make_agent(make_args(init_gains=(1.0, 1.0, 1.0)), 3, 1)
+    with torch.no_grad():
+        agent.actor_logstd.fill_(0.5)
+        agent.actor_mean[4].bias.fill_(0.3)
+    agent.obs_mean.copy_(torch.tensor([0.1, -0.2, 0.5]))
+    agent.obs_divisor.copy_(torch.tensor([0.7, 0.5, 2.0]))
+    scores, noise = {}, {}
+    for mode in ("greedy", "sampled"):
+        args = make_args(eval_mode=mode, eval_episodes=2, save_demos=3)
+        (tmp_path / mode).mkdir()
+        evaluation = ppo.evaluate(agent, args, tmp_path / mode)
+        scores[mode] = evaluation["returns"]
+        env = ppo.make_env("Pendulum-v1")
+        assert evaluation["returns"] == [
+            ppo.play(agent, env, args, seed)["rewards"].sum() for seed in evaluation["seeds"]
+        ]
+        ppo.save_demonstrations(agent, args, tmp_path / mode)
+        deviations = []
+        for path in sorted((tmp_path / mode / "demos").glob("*.npz")):
+            with np.load(path, allow_pickle=False) as arrays:
+                obs, actions = arrays["observations"][:-1], arrays["actions"]
+            scaled = (torch.from_numpy(obs) - agent.obs_mean) / agent.obs_divisor
+            mean = agent.actor_mean(scaled.clamp(-args.clip_obs, args.clip_obs).float()).detach().numpy()
+            deviations.append(actions - mean)
+            assert np.abs(actions).max() <= 2
+        noise[mode] = np.concatenate(deviations)
+        manifest = json.loads((tmp_path / mode / "demos" / "manifest.json").read_text())
+        assert evaluation["mode"] == manifest["mode"] == mode and len(deviations) == 3
+    assert np.abs(noise["greedy"]).max() < 1e-5 and set(scores["greedy"]).isdisjoint(scores["sampled"])
+    quartiles = np.quantile(noise["sampled"] / math.exp(0.5), [0.25, 0.5, 0.75])  # of 600: bounds do not move them
+    assert np.allclose(quartiles, Normal(0, 1).icdf(torch.tensor([0.25, 0.5, 0.75])), atol=0.15)
