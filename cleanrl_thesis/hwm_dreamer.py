@@ -651,10 +651,15 @@ class Replay:
         """Raises RunError where the file of a run that goes on is not there whole."""
         self.args, self.painter = args, painter(ROOM_SIZES[args.env_id], args.frame_side)
         capacity = 2 * args.total_timesteps // args.num_envs + 2  # an episode has a first record and at least one more
-        is_whole = path.exists() and path.stat().st_size == args.num_envs * capacity * RECORD.itemsize
-        if goes_on and not is_whole:
+        size = args.num_envs * capacity * RECORD.itemsize
+        if goes_on and not (path.exists() and path.stat().st_size == size):
             raise RunError(f"{path}: missing or cut short; the run cannot go on without its replay")
-        self.rows = np.memmap(path, RECORD, "r+" if goes_on else "w+", shape=(args.num_envs, capacity))
+        path.touch()
+        with open(path, "r+b") as file:  # not "a": file systems without fallocate of their own refuse it then
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)  # a full disk is an error here, not a signal later
+            file.truncate(size)
+        self.rows = np.memmap(path, RECORD, "r+", shape=(args.num_envs, capacity))
         self.lengths = np.zeros(args.num_envs, np.int64)
         self.rewarded: list[list[int]] = [[] for _ in range(args.num_envs)]  # of each game, the records with a reward
 

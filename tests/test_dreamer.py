@@ -2,8 +2,10 @@
 
 import csv
 import ctypes
+import errno
 import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -755,6 +757,23 @@ def test_a_run_does_not_go_on_without_its_replay(tmp_path, change):
     change(tmp_path / "run" / "replay.dat")
     done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path, code=1, script=SCRIPT)
     assert "replay.dat: missing or cut short" in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="this system reserves no bytes")
+def test_a_full_disk_is_one_line_before_the_first_step(tmp_path, monkeypatch):
+    """The replay's bytes are reserved: a page without a block would end the process by a signal, hours later."""
+    args = make_args()
+    size = method.Replay(tmp_path / "replay.dat", args).rows.nbytes
+    about = (tmp_path / "replay.dat").stat()
+    assert about.st_size == size <= 512 * about.st_blocks
+
+    def full(file, begin, size):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    done = run(*SMALL, "--run-dir", "run", cwd=tmp_path, code=1, script=SCRIPT)
+    assert "No space left on device" in done.stderr and done.stderr.count("\n") == 1
+    assert not (tmp_path / "run" / "episodes.csv").exists()
 
 
 def test_losses_that_explode_end_the_run(tmp_path):
