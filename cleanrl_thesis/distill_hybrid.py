@@ -153,15 +153,15 @@ class Args:
     states: Literal["human", "own"] = "human"
     """states of the DQN's term: the human's, or those of the DQN's own play (section 2.3.2)"""
     epochs: int = 100
-    """passes over the training set"""
+    """passes over the training set (ours)"""
     batch_size: int = 64
-    """frames per update"""
+    """frames per update (ours)"""
     learning_rate: float = 1e-4
     """Adam's learning rate (section 2.4.1)"""
     dropout: float = 0.5
     """share of hidden units left out in training (section 2.4.1)"""
     hidden_size: int = 256
-    """units in each of the two hidden layers"""
+    """units in each of the two hidden layers (ours)"""
 
 
 DEFAULTS = {"demo_frames": 16_000, "test_frames": 1_500, "alpha": 0.93, "eval_episodes": 400}
@@ -237,7 +237,9 @@ def complete_args(args: Args) -> Args:
     together = args.states == "human" or args.teacher is not None and args.split == "frame"
     require(together, "--states", "own", "needs --teacher, and --split frame: the DQN's frames are of other episodes")
     known = args.demos is not None or args.env_id.split(":")[-1] in SYNTHETIC_HUMANS
-    require(known, "--env-id", args.env_id, f"needs --demos; only {', '.join(SYNTHETIC_HUMANS)} has a synthetic human")
+    require(
+        known, "--env-id", args.env_id, f"needs --demos; only {' and '.join(SYNTHETIC_HUMANS)} have a synthetic human"
+    )
     if args.track and importlib.util.find_spec("wandb") is None:
         raise UsageError("--track: needs Weights and Biases: pip install wandb")
     if args.capture_video and importlib.util.find_spec("moviepy") is None:
@@ -456,7 +458,7 @@ class AtariGame(gym.Env):
         if seed is not None:
             numpy_seed, emulator_seed = np.random.SeedSequence(seed).generate_state(2)
             self.np_random = np.random.default_rng(int(numpy_seed))
-            self.emulator.setInt("random_seed", np.int32(emulator_seed.astype(np.int32)))
+            self.emulator.setInt("random_seed", emulator_seed.astype(np.int32))
             self.emulator.loadROM(self.rom)
         self.emulator.reset_game()
         for _ in range(self.np_random.integers(1, self.noop_max + 1) if self.noop_max else 0):
@@ -532,7 +534,7 @@ def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     space, actions = env.observation_space, env.action_space
     is_flat = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
-    allowed = "needs flat Box observations or images, (C, H, W) uint8 and at least 36 x 36; this one has"
+    allowed = "needs flat Box observations or images, (C, H, W) uint8 and at least 20 x 20; this one has"
     require(is_flat or is_image(space), "--env-id", env_id, f"{allowed} {space}")
     is_discrete = isinstance(actions, gym.spaces.Discrete) and actions.start == 0
     require(is_discrete, "--env-id", env_id, f"needs Discrete actions from 0, this one has {actions}")
@@ -681,7 +683,168 @@ class SyntheticGopherHuman:
         return {NOOP: FIRE, GO_RIGHT: RIGHT_FIRE, GO_LEFT: LEFT_FIRE}[move]
 
 
-SYNTHETIC_HUMANS = {"AppleGame-v0": SyntheticHuman, "ALE/Gopher-v5": SyntheticGopherHuman}
+SYNTHETIC_HUMANS = ("AppleGame-v0", "ALE/Gopher-v5")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Networks: the teachers, and the student
+# ---------------------------------------------------------------------------------------------------------------------
+class QNetwork(nn.Module):
+    """Q(s, ·) of each action: a trunk of two layers, then one linear head, or with `dueling` V(s) + A(s, ·) − mean A."""
+
+    def __init__(self, obs_dim: int, num_actions: int, hidden_size: int, dueling: bool):
+        super().__init__()
+        first, second = nn.Linear(obs_dim, hidden_size), nn.Linear(hidden_size, hidden_size)
+        self.trunk = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
+        self.advantage = nn.Linear(hidden_size, num_actions)
+        self.value = nn.Linear(hidden_size, 1) if dueling else None
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (B, O) -> action values (B, A)."""
+        features = self.trunk(obs)
+        advantage = self.advantage(features)
+        if self.value is None:
+            return advantage
+        return self.value(features) + advantage - advantage.mean(1, keepdim=True)
+
+
+def numpy_greedy(agent: QNetwork):
+    """argmax Q as a numpy function, (N, O) -> (N,): without torch's overhead of 100 µs for one observation.
+
+    On the CPU it shares the agent's memory; on a GPU it is a copy, to be made anew after each update. It needs no V(s).
+    """
+    linears = [agent.trunk[0], agent.trunk[2], agent.advantage]
+    layers = [[tensor.detach().cpu().numpy() for tensor in (linear.weight.T, linear.bias)] for linear in linears]
+    *hidden, (output_weight, output_bias) = layers
+
+    def greedy(x: np.ndarray) -> np.ndarray:
+        for weight, bias in hidden:
+            x = x.dot(weight)
+            x += bias
+            np.maximum(x, 0, out=x)
+        x = x.dot(output_weight)
+        x += output_bias
+        return x.argmax(1)
+
+    return greedy
+
+
+def has_bf16(device: torch.device) -> bool:
+    """Whether the device computes in bfloat16: a CPU without such instructions takes several times as long as in float32."""
+    return device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
+class AtariQNetwork(nn.Module):
+    """Q(s, ·) of each action: convolutions (for the memory's bytes two layers), a hidden layer, one linear head.
+
+    With `dueling` two heads, each on one half of the hidden layer: V(s) + A(s, ·) − mean A.
+    """
+
+    def __init__(
+        self, obs_shape: tuple[int, ...], num_actions: int, hidden_size: int, dueling: bool, bf16: bool = False
+    ):
+        super().__init__()
+        self.bf16, self.head_size = bf16, (hidden_size // 2 if dueling else hidden_size)
+        if len(obs_shape) == 3:
+            layers = nn.Conv2d(obs_shape[0], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)
+        else:
+            layers = nn.Linear(math.prod(obs_shape), 256), nn.Linear(256, 256)
+        self.trunk = nn.ModuleList(layers)
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            features = self.features(torch.zeros(1, *obs_shape)).shape[1]
+        self.hidden = nn.Linear(features, hidden_size)
+        self.advantage = nn.Linear(self.head_size, num_actions)
+        self.value = nn.Linear(self.head_size, 1) if dueling else None
+
+    def features(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (B, S, 84, 84) or (B, S, 128) of 0 to 255 -> features (B, F)."""
+        first, *others = self.trunk
+        x = obs.to(torch.bfloat16 if self.bf16 else torch.float32)  # exact: bfloat16 has all integers up to 256
+        weight = first.weight / 255  # instead of the observations, which are more
+        if obs.ndim == 4:  # channels last in memory, which is faster
+            x = F.conv2d(x.contiguous(memory_format=torch.channels_last), weight, first.bias, first.stride)
+        else:
+            x = F.linear(x.flatten(1), weight, first.bias)
+        for layer in others:
+            x = layer(torch.relu(x))
+        return torch.relu(x).flatten(1)
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (B, S, 84, 84) or (B, S, 128) uint8 -> action values (B, A)."""
+        with torch.autocast(obs.device.type, torch.bfloat16, enabled=self.bf16):
+            hidden = torch.relu(self.hidden(self.features(obs)))
+        hidden = hidden.float()
+        advantage = self.advantage(hidden[:, -self.head_size :])
+        if self.value is None:
+            return advantage
+        return self.value(hidden[:, : self.head_size]) + advantage - advantage.mean(1, keepdim=True)
+
+
+def greedy_policy(agent: AtariQNetwork, device: torch.device):
+    """argmax Q as a numpy function, observations (N, ...) uint8 -> actions (N,)."""
+
+    def greedy(obs: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return agent(torch.from_numpy(obs).to(device)).argmax(1).cpu().numpy()
+
+    return greedy
+
+
+def epsilon_greedy_policy(greedy, num_actions: int, epsilon: float, seed: int):
+    """The greedy policy with a share of random actions."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, EVALUATION_STREAM]))
+
+    def policy(obs: np.ndarray) -> np.ndarray:
+        random_actions = rng.integers(num_actions, size=len(obs))
+        return np.where(rng.random(len(obs)) < epsilon, random_actions, greedy(obs))
+
+    return policy
+
+
+def convolutions(channels: int) -> nn.Sequential:
+    """The convolutions of Mnih et al. (2013), smaller than the DQN's, for images (M, C, H, W)."""
+    layers = nn.Conv2d(channels, 16, 8, 4), nn.Conv2d(16, 32, 4, 2)
+    return nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())), nn.Flatten())
+
+
+class Student(nn.Module):
+    """π(a|s) as a network of two hidden layers, over convolutions where observations are images."""
+
+    def __init__(self, obs_shape: tuple[int, ...], num_actions: int, hidden_size: int, bf16: bool = False):
+        super().__init__()
+        self.convolutions, features, self.bf16 = None, obs_shape[0], bf16
+        if len(obs_shape) == 3:
+            self.convolutions = convolutions(obs_shape[0])
+            features = self.convolutions(torch.zeros(1, *obs_shape)).shape[1]
+        self.layers = nn.ModuleList(
+            [nn.Linear(features, hidden_size), nn.Linear(hidden_size, hidden_size), nn.Linear(hidden_size, num_actions)]
+        )
+
+    def features(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (M, O) -> the same; images (M, C, H, W) of 0 to 255 -> (M, F)."""
+        if self.convolutions is None:
+            return obs.float()
+        first, *others = self.convolutions
+        x = obs.to(torch.bfloat16 if self.bf16 else torch.float32)  # exact: bfloat16 has all integers up to 256
+        x = x.contiguous(memory_format=torch.channels_last)  # faster; and 255 divides the weights, which are fewer
+        x = F.conv2d(x, first.weight / 255, first.bias, first.stride)
+        for layer in others:
+            x = layer(x)
+        return x
+
+    def forward(self, obs: torch.Tensor, masks: torch.Tensor | None = None) -> torch.Tensor:
+        """Observations (M, O), or (M, C, H, W) uint8 -> logits (M, A); `masks` (2, M, H) multiply the hidden units."""
+        first, second, output = self.layers
+        with torch.autocast(obs.device.type, torch.bfloat16, enabled=self.bf16):
+            hidden = torch.relu(first(self.features(obs)))
+        hidden = hidden.float()
+        hidden = torch.relu(second(hidden if masks is None else hidden * masks[0]))
+        return output(hidden if masks is None else hidden * masks[1])
+
+
+def draw_masks(shape: tuple[int, int, int], dropout: float) -> torch.Tensor:
+    """Dropout masks, drawn outside of the network so that they are the same in a compiled graph: 0 or 1 / (1 − p)."""
+    return (torch.rand(shape) >= dropout).float() / (1 - dropout)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -830,8 +993,7 @@ def make_human_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
         return make_gopher_demonstrations(args)
     count = math.ceil(args.demo_frames / EPISODE_FRAMES)
     seeds = [episode_seed(args.seed, HUMAN_STREAM, i) for i in range(count)]
-    human = SYNTHETIC_HUMANS[args.env_id.split(":")[-1]](count, args.seed)
-    return play(human, args.env_id, seeds, keep=True)
+    return play(SyntheticHuman(count, args.seed), args.env_id, seeds, keep=True)
 
 
 def make_gopher_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
@@ -839,124 +1001,11 @@ def make_gopher_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
     episodes, frames, game = [], 0, make_env(args.env_id)
     make_game = functools.partial(make_atari, args.env_id, obs_type="ram", frame_stack=1)
     while frames < args.demo_frames:
-        human = SYNTHETIC_HUMANS[args.env_id](args.seed, len(episodes))
+        human = SyntheticGopherHuman(args.seed, len(episodes))
         episode = play_atari(human, make_game, [episode_seed(args.seed, HUMAN_STREAM, len(episodes))])[0]
         episodes.append({**episode, "observations": watch(game, episode)})
         frames += len(episode["actions"])
     return episodes
-
-
-class QNetwork(nn.Module):
-    """Q(s, ·) of each action: a trunk of two layers, then one linear head, or with `dueling` V(s) + A(s, ·) − mean A."""
-
-    def __init__(self, obs_dim: int, num_actions: int, hidden_size: int, dueling: bool):
-        super().__init__()
-        self.trunk = nn.Sequential(
-            *(nn.Linear(obs_dim, hidden_size), nn.ReLU(), nn.Linear(hidden_size, hidden_size), nn.ReLU())
-        )
-        self.advantage = nn.Linear(hidden_size, num_actions)
-        self.value = nn.Linear(hidden_size, 1) if dueling else None
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Observations (B, O) -> action values (B, A)."""
-        features = self.trunk(obs)
-        advantage = self.advantage(features)
-        if self.value is None:
-            return advantage
-        return self.value(features) + advantage - advantage.mean(1, keepdim=True)
-
-
-def numpy_greedy(agent: QNetwork):
-    """argmax Q as a numpy function, (N, O) -> (N,): without torch's overhead of 100 µs for one observation.
-
-    On the CPU it shares the agent's memory; on a GPU it is a copy, to be made anew after each update. It needs no V(s).
-    """
-    linears = [agent.trunk[0], agent.trunk[2], agent.advantage]
-    layers = [[tensor.detach().cpu().numpy() for tensor in (linear.weight.T, linear.bias)] for linear in linears]
-    *hidden, (output_weight, output_bias) = layers
-
-    def greedy(x: np.ndarray) -> np.ndarray:
-        for weight, bias in hidden:
-            x = x.dot(weight)
-            x += bias
-            np.maximum(x, 0, out=x)
-        x = x.dot(output_weight)
-        x += output_bias
-        return x.argmax(1)
-
-    return greedy
-
-
-def has_bf16(device: torch.device) -> bool:
-    """Whether the device computes in bfloat16: a CPU without such instructions takes several times as long as in float32."""
-    return device.type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
-
-
-class AtariQNetwork(nn.Module):
-    """Q(s, ·) of each action: convolutions (for the memory's bytes two layers), a hidden layer, one linear head.
-
-    With `dueling` two heads, each on one half of the hidden layer: V(s) + A(s, ·) − mean A.
-    """
-
-    def __init__(
-        self, obs_shape: tuple[int, ...], num_actions: int, hidden_size: int, dueling: bool, bf16: bool = False
-    ):
-        super().__init__()
-        self.bf16, self.head_size = bf16, (hidden_size // 2 if dueling else hidden_size)
-        if len(obs_shape) == 3:
-            layers = nn.Conv2d(obs_shape[0], 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3, 1)
-        else:
-            layers = nn.Linear(math.prod(obs_shape), 256), nn.Linear(256, 256)
-        self.trunk = nn.ModuleList(layers)
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            features = self.features(torch.zeros(1, *obs_shape)).shape[1]
-        self.hidden = nn.Linear(features, hidden_size)
-        self.advantage = nn.Linear(self.head_size, num_actions)
-        self.value = nn.Linear(self.head_size, 1) if dueling else None
-
-    def features(self, obs: torch.Tensor) -> torch.Tensor:
-        """Observations (B, S, 84, 84) or (B, S, 128) of 0 to 255 -> features (B, F)."""
-        first, *others = self.trunk
-        x = obs.to(torch.bfloat16 if self.bf16 else torch.float32)  # exact: bfloat16 has all integers up to 256
-        weight = first.weight / 255  # instead of the observations, which are more
-        if obs.ndim == 4:  # channels last in memory, which is faster
-            x = F.conv2d(x.contiguous(memory_format=torch.channels_last), weight, first.bias, first.stride)
-        else:
-            x = F.linear(x.flatten(1), weight, first.bias)
-        for layer in others:
-            x = layer(torch.relu(x))
-        return torch.relu(x).flatten(1)
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Observations (B, S, 84, 84) or (B, S, 128) uint8 -> action values (B, A)."""
-        with torch.autocast(obs.device.type, torch.bfloat16, enabled=self.bf16):
-            hidden = torch.relu(self.hidden(self.features(obs)))
-        hidden = hidden.float()
-        advantage = self.advantage(hidden[:, -self.head_size :])
-        if self.value is None:
-            return advantage
-        return self.value(hidden[:, : self.head_size]) + advantage - advantage.mean(1, keepdim=True)
-
-
-def greedy_policy(agent: AtariQNetwork, device: torch.device):
-    """argmax Q as a numpy function, observations (N, ...) uint8 -> actions (N,)."""
-
-    def greedy(obs: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return agent(torch.from_numpy(obs).to(device)).argmax(1).cpu().numpy()
-
-    return greedy
-
-
-def epsilon_greedy_policy(greedy, num_actions: int, epsilon: float, seed: int):
-    """The greedy policy with a share of random actions."""
-    rng = np.random.default_rng(np.random.SeedSequence([seed, EVALUATION_STREAM]))
-
-    def policy(obs: np.ndarray) -> np.ndarray:
-        random_actions = rng.integers(num_actions, size=len(obs))
-        return np.where(rng.random(len(obs)) < epsilon, random_actions, greedy(obs))
-
-    return policy
 
 
 def load_teacher(folder: Path, env_id: str, bf16: bool = False) -> QNetwork | AtariQNetwork:
@@ -989,52 +1038,6 @@ def load_teacher(folder: Path, env_id: str, bf16: bool = False) -> QNetwork | At
 # ---------------------------------------------------------------------------------------------------------------------
 # The algorithm
 # ---------------------------------------------------------------------------------------------------------------------
-def convolutions(channels: int) -> nn.Sequential:
-    """The convolutions of Mnih et al. (2013), smaller than the DQN's, for images (M, C, H, W)."""
-    layers = nn.Conv2d(channels, 16, 8, 4), nn.Conv2d(16, 32, 4, 2)
-    return nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())), nn.Flatten())
-
-
-class Student(nn.Module):
-    """π(a|s) as a network of two hidden layers, over convolutions where observations are images."""
-
-    def __init__(self, obs_shape: tuple[int, ...], num_actions: int, hidden_size: int, bf16: bool = False):
-        super().__init__()
-        self.convolutions, features, self.bf16 = None, obs_shape[0], bf16
-        if len(obs_shape) == 3:
-            self.convolutions = convolutions(obs_shape[0])
-            features = self.convolutions(torch.zeros(1, *obs_shape)).shape[1]
-        self.layers = nn.ModuleList(
-            [nn.Linear(features, hidden_size), nn.Linear(hidden_size, hidden_size), nn.Linear(hidden_size, num_actions)]
-        )
-
-    def features(self, obs: torch.Tensor) -> torch.Tensor:
-        """Observations (M, O) -> the same; images (M, C, H, W) of 0 to 255 -> (M, F)."""
-        if self.convolutions is None:
-            return obs.float()
-        first, *others = self.convolutions
-        x = obs.to(torch.bfloat16 if self.bf16 else torch.float32)  # exact: bfloat16 has all integers up to 256
-        x = x.contiguous(memory_format=torch.channels_last)  # faster; and 255 divides the weights, which are fewer
-        x = F.conv2d(x, first.weight / 255, first.bias, first.stride)
-        for layer in others:
-            x = layer(x)
-        return x
-
-    def forward(self, obs: torch.Tensor, masks: torch.Tensor | None = None) -> torch.Tensor:
-        """Observations (M, O), or (M, C, H, W) uint8 -> logits (M, A); `masks` (2, M, H) multiply the hidden units."""
-        first, second, output = self.layers
-        with torch.autocast(obs.device.type, torch.bfloat16, enabled=self.bf16):
-            hidden = torch.relu(first(self.features(obs)))
-        hidden = hidden.float()
-        hidden = torch.relu(second(hidden if masks is None else hidden * masks[0]))
-        return output(hidden if masks is None else hidden * masks[1])
-
-
-def draw_masks(shape: tuple[int, int, int], dropout: float) -> torch.Tensor:
-    """Dropout masks, drawn outside of the network so that they are the same in a compiled graph: 0 or 1 / (1 − p)."""
-    return (torch.rand(shape) >= dropout).float() / (1 - dropout)
-
-
 def soft_labels(q_values: torch.Tensor, temperature: float) -> torch.Tensor:
     """π_RL⁽ᵀ⁾(·|s), (F, A): softmax(Q / T), and for T = 0 one on the best action (section 2.3.2)."""
     if temperature == 0:
@@ -1062,15 +1065,19 @@ class Data(NamedTuple):
     he_obs: torch.Tensor  # (F, O) or images, states of the human's term
     he_actions: torch.Tensor  # (F,)
 
+    def shares_states(self) -> bool:
+        """Whether the DQN's term is over the human's states."""
+        return self.rl_obs is self.he_obs
+
     def at(self, frames: torch.Tensor) -> "Data":
         """The frames of the given indices, or where a mask says so."""
         he_obs = self.he_obs[frames]
-        rl_obs = he_obs if self.rl_obs is self.he_obs else self.rl_obs[frames]
+        rl_obs = he_obs if self.shares_states() else self.rl_obs[frames]
         return Data(rl_obs, self.rl_labels[frames], he_obs, self.he_actions[frames])
 
     def to(self, device: torch.device) -> "Data":
         he_obs = self.he_obs.to(device)
-        rl_obs = he_obs if self.rl_obs is self.he_obs else self.rl_obs.to(device)
+        rl_obs = he_obs if self.shares_states() else self.rl_obs.to(device)
         return Data(rl_obs, self.rl_labels.to(device), he_obs, self.he_actions.to(device))
 
 
@@ -1141,11 +1148,12 @@ class Update:
         parameters = dict(zip(self.names, views(vector, self.shapes)))
         he_logits = torch.func.functional_call(self.student, parameters, (minibatch.he_obs, masks))
         rl_logits = he_logits
-        if self.args.states == "own":
+        if self.args.states == "own":  # by the flag, for a compiled graph cannot tell one tensor from another
             rl_logits = torch.func.functional_call(self.student, parameters, (minibatch.rl_obs, masks))
         return hybrid_loss(rl_logits, minibatch.rl_labels, he_logits, minibatch.he_actions, self.args.alpha)
 
     def plain_step(self, vector, mean, square, count, minibatch: Data, masks: torch.Tensor):
+        """A step of Adam on `loss`; changes the first four, (P,) and a scalar, in place; returns the two terms of the loss."""
         gradient, parts = torch.func.grad(self.loss, has_aux=True)(vector, minibatch, masks)
         adam_step(vector, mean, square, count, self.args.learning_rate, gradient, math.inf, 1e-8)
         return parts
@@ -1167,8 +1175,7 @@ class Update:
 def measure(student: Student, data: Data, args: Args) -> dict[str, float]:
     """Loss and agreement with each teacher on frames that are not trained on."""
     he_logits = torch.cat([student(part) for part in data.he_obs.split(5_000)])
-    same = data.rl_obs is data.he_obs
-    rl_logits = he_logits if same else torch.cat([student(part) for part in data.rl_obs.split(5_000)])
+    rl_logits = he_logits if data.shares_states() else torch.cat([student(part) for part in data.rl_obs.split(5_000)])
     loss, _ = hybrid_loss(rl_logits, data.rl_labels, he_logits, data.he_actions, args.alpha)
     agrees_rl = (rl_logits.argmax(1) == data.rl_labels.argmax(1)).float().mean().item()
     agrees_he = (he_logits.argmax(1) == data.he_actions).float().mean().item()
@@ -1190,6 +1197,7 @@ SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, 
 FINISH = ("eval_episodes", "eval_mode", "capture_video", "save_model", "save_demos")
 FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "checkpoint_interval", *FINISH}
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
+FREE_ON_RESUME |= {"teacher", "demos"}  # what they hold is compared, not where it lies
 
 
 def write_whole(path: Path, content: bytes, keep_old_as: str | None = None) -> None:
@@ -1715,8 +1723,8 @@ def main(args: Args) -> int:
         return 0
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     bf16 = args.bf16 and has_bf16(device)
-    on_cpu = args.bf16 and has_bf16(torch.device("cpu"))  # where the teacher labels the frames
-    teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id, on_cpu)
+    teacher_bf16 = args.bf16 and has_bf16(torch.device("cpu"))  # which labels the frames on the CPU
+    teacher = None if args.teacher is None else load_teacher(args.teacher, args.env_id, teacher_bf16)
     human_episodes = read_human(args)
     torch.set_num_threads(args.num_threads)
     human = join_frames(human_episodes, args.demo_frames)
@@ -1728,8 +1736,8 @@ def main(args: Args) -> int:
     is_test = torch.from_numpy(split_frames(human.episodes, args.test_frames, args.split, split_rng))
     require(not is_test.all(), "--split", args.split, f"leaves no episode to train on, with {args.test_frames} to test")
     run_dir, checkpoint = begun or open_run_dir(args)
-    learned_from = fingerprint(human, teacher)
-    same_data = checkpoint is None or checkpoint["data"] == learned_from
+    data_id = fingerprint(human, teacher)
+    same_data = checkpoint is None or checkpoint["data"] == data_id
     require(same_data, "--resume", run_dir, "demonstrations or teacher are no longer those that the run began with")
     lost = checkpoint is None and (run_dir / "result.json").exists()
     require(not lost, "--resume", run_dir, "was finished with other flags, and its checkpoint is gone")
@@ -1791,7 +1799,7 @@ def main(args: Args) -> int:
             state = {
                 "args": arguments(args),
                 "arithmetic": arithmetic,
-                "data": learned_from,
+                "data": data_id,
                 "epoch": epoch,
                 "training_seconds": training_seconds,
                 "offset": updates_csv.sync(),

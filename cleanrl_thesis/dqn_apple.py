@@ -11,14 +11,14 @@ crash: on the same machine the run ends with the same bytes.
 |---|---|---|
 | frames, replay buffer, ε | 8,000,000; 200,000; 1.0 → 0.1 | section 2.4.1 |
 | batch, learning rate, target update, ε's share of the frames | 32, 5e-4, every 500 frames, 10% | OpenAI Baselines' defaults |
-| learning rate annealed to 0 | on | ours; Baselines' is constant, and its greedy policy dithers beside apples |
+| learning rate annealed to 0 | on | ours; Baselines' is constant, with which the greedy policy jitters beside apples |
 | Huber loss, gradient norm 10, double, dueling, start of learning | on, on, on, on, 1,000 frames | OpenAI Baselines' defaults |
 | γ | 0.99 | ours; Baselines' plain learner has 1.0, with which a game without end has no finite values |
-| one update per frames | 4 | ours; Baselines' plain learner has 1, the usual number for Atari is 4 |
+| updates | one every 4 frames | ours; Baselines' plain learner: one every frame; usual for Atari: every 4 |
 | network | 64-64 with ReLU, dueling heads without a hidden layer | ours; Baselines has tanh, and heads of 256 |
 
 Frames are game frames everywhere in chapter 2: with `--frame-skip 4` the agent acts once in four of them. The end of the
-30 s is a time-out, not an end: the replay buffer keeps the real next observation, and the value goes on behind it.
+30 s is a time-out, not an end: the replay buffer keeps the real next observation, and its value is bootstrapped from.
 """
 
 # /// script
@@ -121,9 +121,9 @@ class Args:
     total_timesteps: int = 8_000_000
     """game frames (section 2.4.1)"""
     num_envs: int = 1
-    """environments stepped in turn"""
+    """environments stepped in turn (Baselines: 1)"""
     frame_skip: int = 1
-    """frames for which an action is repeated"""
+    """frames for which an action is repeated (ours)"""
     learning_rate: float = 5e-4
     """Adam's learning rate (Baselines)"""
     anneal_lr: bool = True
@@ -133,7 +133,7 @@ class Args:
     buffer_size: int = 200_000
     """transitions in the replay buffer (section 2.4.1)"""
     gamma: float = 0.99
-    """discount factor γ per action"""
+    """discount factor γ per action (ours; Baselines' plain learner: 1.0)"""
     target_network_frequency: int = 500
     """frames between updates of the target network (Baselines)"""
     batch_size: int = 32
@@ -147,7 +147,7 @@ class Args:
     learning_starts: int = 1_000
     """frame of the first update (Baselines)"""
     train_frequency: int = 4
-    """frames per update"""
+    """frames per update (ours; Baselines' plain learner: 1)"""
     max_grad_norm: float = 10.0
     """bound on the norm of the gradient, of all parameters together; inf for none (Baselines: the same, of each variable)"""
     double: bool = True
@@ -155,7 +155,7 @@ class Args:
     dueling: bool = True
     """dueling heads: Q = V + A − mean A (Baselines)"""
     n_step: int = 1
-    """rewards summed before the value of the next state"""
+    """rewards summed before the value of the next state (Baselines: 1)"""
 
     # to be filled in runtime
     num_iterations: tyro.conf.Suppress[int] = 0
@@ -197,10 +197,12 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
-    counts = "num_envs frame_skip batch_size buffer_size eval_episodes checkpoint_interval stop_at n_step hidden_size"
+    counts = (
+        "num_envs frame_skip batch_size buffer_size eval_episodes checkpoint_interval stop_at n_step hidden_size "
+        "train_frequency target_network_frequency"
+    )
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
-        ("train_frequency target_network_frequency", lambda x: x >= 1, "must be at least 1"),
         ("learning_rate", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("max_grad_norm", lambda x: x > 0, "must be greater than 0"),
         ("gamma start_e end_e exploration_fraction", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
@@ -421,9 +423,8 @@ class QNetwork(nn.Module):
 
     def __init__(self, obs_dim: int, num_actions: int, hidden_size: int, dueling: bool):
         super().__init__()
-        self.trunk = nn.Sequential(
-            *(nn.Linear(obs_dim, hidden_size), nn.ReLU(), nn.Linear(hidden_size, hidden_size), nn.ReLU())
-        )
+        first, second = nn.Linear(obs_dim, hidden_size), nn.Linear(hidden_size, hidden_size)
+        self.trunk = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
         self.advantage = nn.Linear(hidden_size, num_actions)
         self.value = nn.Linear(hidden_size, 1) if dueling else None
 
@@ -515,6 +516,11 @@ class Episode:
         return obs
 
 
+def row_bytes(obs_dim: int) -> int:
+    """Bytes of a transition in the replay buffer: two observations (O,), action, return and discount as float32."""
+    return 4 * (2 * obs_dim + 3)
+
+
 class ReplayBuffer:
     """The last `capacity` transitions, in a file that is written in place: a checkpoint keeps only how many there were.
 
@@ -525,8 +531,7 @@ class ReplayBuffer:
     def __init__(self, path: Path, capacity: int, spare: int, obs_dim: int, added: int = 0):
         """Go on in the file after `added` transitions, or begin it. Raises RunError where it is not the whole file."""
         self.capacity, self.slots, self.added = capacity, capacity + spare, added
-        shape = (self.slots, 2 * obs_dim + 3)
-        size = 4 * math.prod(shape)
+        shape, size = (self.slots, row_bytes(obs_dim) // 4), self.slots * row_bytes(obs_dim)
         if added and not (path.exists() and path.stat().st_size == size):
             raise RunError(f"{path}: not the replay buffer of the last checkpoint; the run cannot be resumed")
         path.touch()
@@ -582,7 +587,7 @@ class Player:
         return result
 
     def add_oldest(self, buffer: ReplayBuffer, terminated: bool) -> None:
-        """Move the oldest waiting step into the buffer. Behind a time-out the value goes on, behind an end it does not."""
+        """Move the oldest waiting step into the buffer. A time-out bootstraps from the next value, a termination does not."""
         total, discount = 0.0, 1.0
         for _, _, reward in self.window:
             total += discount * reward
@@ -752,9 +757,11 @@ class CompiledUpdate(PlainUpdate):
         return torch.func.functional_call(self.agent, parameters, (obs,))
 
     def loss(self, vector: torch.Tensor, minibatch: Minibatch, target: torch.Tensor):
+        """`dqn_loss` as a function of the vector of parameters (P,); target (M,)."""
         return dqn_loss(self.q_values(vector, minibatch.obs), minibatch, target)
 
     def step(self, vector, mean, square, step, rate, target_vector, rows) -> tuple[torch.Tensor, ...]:
+        """One update by the replay's `rows` (M, 2 O + 3) as one graph; changes the vectors (P,) but the target's in place."""
         minibatch = Minibatch.unpack(rows)
         online_q = self.q_values(vector, minibatch.next_obs) if self.double else None
         target = td_target(minibatch, self.q_values(target_vector, minibatch.next_obs), online_q)
@@ -790,7 +797,7 @@ def make_update(agent: QNetwork, target_network: QNetwork, optimizer: FlatAdam, 
 CHECKPOINT_FORMAT = "dqn_apple 1"
 SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("eval_episodes", "capture_video", "save_model", "save_demos")
-FREE_ON_RESUME = {"run_dir", "resume", "stop_at", *FINISH}
+FREE_ON_RESUME = {"run_dir", "resume", "stop_at", *FINISH}  # not checkpoint_interval, which sizes replay.dat
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
 
 
@@ -1182,10 +1189,11 @@ def main(args: Args) -> int:
     envs = [make_env(args.env_id) for _ in range(args.num_envs)]
     if args.capture_video:
         check_video(args.env_id)
-    row = 4 * (2 * envs[0].observation_space.shape[0] + 3)
-    check_disk(args, "--buffer-size", args.buffer_size, args.buffer_size * row)
+    frames_per_step, obs_dim = args.num_envs * args.frame_skip, envs[0].observation_space.shape[0]
+    between = max(args.checkpoint_interval, frames_per_step) + args.n_step * args.num_envs  # two checkpoints, at most
+    spare = 2 * min(between, args.num_iterations * args.num_envs)
+    check_disk(args, "--buffer-size", args.buffer_size, (args.buffer_size + spare) * row_bytes(obs_dim))
     run_dir, checkpoint = open_run_dir(args)
-    frames_per_step = args.num_envs * args.frame_skip
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / frames_per_step))
     if is_done(run_dir, args, last_iteration * frames_per_step):
         print(f"{run_dir} is done")
@@ -1207,13 +1215,11 @@ def main(args: Args) -> int:
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     stop = StopSignal()
 
-    obs_dim, num_actions = envs[0].observation_space.shape[0], int(envs[0].action_space.n)
+    num_actions = int(envs[0].action_space.n)
     agent = QNetwork(obs_dim, num_actions, args.hidden_size, args.dueling).to(device)
     target_network = QNetwork(obs_dim, num_actions, args.hidden_size, args.dueling).to(device)
     optimizer = FlatAdam(agent, target_network, args.learning_rate)
     players = [Player(Episode(env, args.seed, i, args.frame_skip), args) for i, env in enumerate(envs)]
-    between = max(args.checkpoint_interval, frames_per_step) + args.n_step * args.num_envs  # two checkpoints, at most
-    spare = 2 * min(between, args.num_iterations * args.num_envs)
     added = 0 if checkpoint is None else checkpoint["added"]
     is_trained = checkpoint is not None and checkpoint["iteration"] >= last_iteration  # only its end is done again
     buffer = None if is_trained else ReplayBuffer(run_dir / "replay.dat", args.buffer_size, spare, obs_dim, added)

@@ -13,7 +13,7 @@ machine the run ends with the same bytes.
 |---|---|---|
 | frames, replay buffer, ε | 10,010,000; 1,000,000; 1.0 → 0.01 | section 2.4.2 |
 | batch, learning rate, γ, ε's share of the frames | 32, 1e-4, 0.99, 10% | OpenAI Baselines' defaults for Atari |
-| one update per, target update per, first update | 4, 1,000, 10,000 actions, an action being 4 frames | OpenAI Baselines' defaults for Atari |
+| updates, target updates, start of learning | every 4 actions, every 1,000, after 10,000 (flags count frames: times 4) | OpenAI Baselines' defaults for Atari |
 | network, Huber loss, gradient norm 10, double, dueling, rewards' signs | on | OpenAI Baselines' defaults for Atari |
 | prioritised replay, the end of a life as an end | off; off (`--life-loss-ends`) | ours; on in OpenAI Baselines |
 | repeated actions | with probability 0.25 | `ALE/*-v5`; thesis: not given |
@@ -208,10 +208,12 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
-    counts = "num_envs frame_skip frame_stack batch_size buffer_size eval_episodes checkpoint_interval stop_at"
+    counts = (
+        "num_envs frame_skip frame_stack batch_size buffer_size eval_episodes checkpoint_interval stop_at "
+        "train_frequency target_network_frequency n_step"
+    )
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
-        ("train_frequency target_network_frequency n_step", lambda x: x >= 1, "must be at least 1"),
         ("learning_rate", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("max_grad_norm", lambda x: x > 0, "must be greater than 0"),
         ("gamma start_e end_e exploration_fraction eval_epsilon", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
@@ -289,7 +291,7 @@ class AtariGame(gym.Env):
         if seed is not None:
             numpy_seed, emulator_seed = np.random.SeedSequence(seed).generate_state(2)
             self.np_random = np.random.default_rng(int(numpy_seed))
-            self.emulator.setInt("random_seed", np.int32(emulator_seed.astype(np.int32)))
+            self.emulator.setInt("random_seed", emulator_seed.astype(np.int32))
             self.emulator.loadROM(self.rom)
         self.emulator.reset_game()
         for _ in range(self.np_random.integers(1, self.noop_max + 1) if self.noop_max else 0):
@@ -672,7 +674,13 @@ class Learner:
 CHECKPOINT_FORMAT = "dqn_gopher 2"
 SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("eval_episodes", "eval_epsilon", "capture_video", "save_model", "save_demos")
-FREE_ON_RESUME = {"run_dir", "resume", "stop_at", "num_threads", *FINISH}
+FREE_ON_RESUME = {
+    "run_dir",
+    "resume",
+    "stop_at",
+    "num_threads",
+    *FINISH,
+}  # not checkpoint_interval, which sizes replay.dat
 FREE_ON_RESUME |= {"track", "wandb_project_name", "wandb_entity"}
 
 
@@ -1013,10 +1021,10 @@ def plot_learning_curve(run_dir: Path, args: Args, evaluation: dict) -> None:
 def print_table(result: dict) -> None:
     """Print the last episodes of training and the evaluation, one line each."""
     print(f"{'':32}{'episodes':>9}{'mean':>11}{'std':>11}{'min':>11}{'max':>11}")
-    per_life = {"mode": "per life", **result["evaluation"]["rewards_per_life"]}
-    for name, row in (
-        *(("training", result["training"]), ("evaluation", result["evaluation"]), ("number of rewards", per_life)),
-    ):
+    evaluation = result["evaluation"]
+    per_life = {"mode": "per life", **evaluation["rewards_per_life"]}
+    rows = {"training": result["training"], "evaluation": evaluation, "number of rewards": per_life}
+    for name, row in rows.items():
         numbers = "".join(f"{row[key]:>11.1f}" for key in ("mean", "std", "min", "max") if row[key] is not None)
         print(f"{name + ' (' + row['mode'] + ')':32}{row['episodes']:>9}{numbers}")
 
@@ -1075,10 +1083,13 @@ def main(args: Args) -> int:
     games = [make_atari(args.env_id, **game_options(args)) for _ in range(args.num_envs)]
     if args.capture_video:
         check_video(args)
-    row = row_type(games[0].observation_space.shape[1:]).itemsize
-    check_disk(args, "--buffer-size", args.buffer_size, min(args.buffer_size, args.total_timesteps) * row)
+    frames_per_step, obs_shape = args.num_envs * args.frame_skip, games[0].observation_space.shape
+    between = max(args.checkpoint_interval // frames_per_step, 1) + 1  # rows of two checkpoints, at most
+    spare = 2 * min(between, args.num_iterations)
+    rows = min(args.buffer_size // args.num_envs, args.num_iterations)
+    row_bytes = args.num_envs * row_type(obs_shape[1:]).itemsize
+    check_disk(args, "--buffer-size", args.buffer_size, (rows + spare) * row_bytes)
     run_dir, checkpoint = open_run_dir(args)
-    frames_per_step = args.num_envs * args.frame_skip
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / frames_per_step))
     if is_done(run_dir, args, last_iteration * frames_per_step):
         print(f"{run_dir} is done")
@@ -1099,18 +1110,15 @@ def main(args: Args) -> int:
     device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
     stop = StopSignal()
 
-    obs_shape, num_actions = games[0].observation_space.shape, int(games[0].action_space.n)
+    num_actions = int(games[0].action_space.n)
     shapes = obs_shape, num_actions, args.hidden_size
     bf16 = args.bf16 and has_bf16(device)
     if args.bf16 and not bf16:
         print("--bf16: no bfloat16 instructions here, goes on in float32", file=sys.stderr)
     learner = Learner(lambda: AtariQNetwork(*shapes, args.dueling, bf16), args, device)
     players = Players(games, args)
-    between = max(args.checkpoint_interval // frames_per_step, 1) + 1  # rows of two checkpoints, at most
-    spare = 2 * min(between, args.num_iterations)
     added = 0 if checkpoint is None else checkpoint["added"]
     is_trained = checkpoint is not None and checkpoint["iteration"] >= last_iteration  # only its end is done again
-    rows = min(args.buffer_size // args.num_envs, args.num_iterations)
     buffer = None if is_trained else ReplayBuffer(run_dir / "replay.dat", rows, spare, args.num_envs, obs_shape, added)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
     means = Means()

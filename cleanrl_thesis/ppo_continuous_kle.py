@@ -728,7 +728,7 @@ class Episode:
         """Begin the next episode and return its first observation (O,)."""
         self.number += 1
         self.actions: list[np.ndarray] = []
-        self.undiscounted_return = self.discounted_return = 0.0
+        self.episodic_return = self.discounted_return = 0.0
         obs, _ = self.env.reset(seed=episode_seed(self.seed, self.stream, self.number))
         return obs.reshape(-1)
 
@@ -737,7 +737,7 @@ class Episode:
         self.actions.append(action)
         obs, reward, terminated, truncated, _ = self.env.step(action.reshape(self.action_shape))
         reward = float(reward)
-        self.undiscounted_return += reward
+        self.episodic_return += reward
         self.discounted_return = self.gamma * self.discounted_return + reward
         return obs.reshape(-1), reward, terminated, truncated
 
@@ -819,7 +819,7 @@ class Collector:
                 if terminated or truncated:
                     rollout.dones[t, i] = 1.0
                     step = t * num_envs + i + 1
-                    rollout.episodes.append((step, episode.undiscounted_return, len(episode.actions)))
+                    rollout.episodes.append((step, episode.episodic_return, len(episode.actions)))
                     if truncated and not terminated:
                         rollout.time_outs.append((t, i, self.normalize(obs).astype(np.float32)))
                     obs = episode.start()

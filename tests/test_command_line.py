@@ -1,6 +1,7 @@
 """What a user can get wrong is one line and exit code 2, and nothing is created."""
 
 import contextlib
+import hashlib
 import json
 import math
 import os
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from conftest import SMALL, command, run
+from conftest import SCRIPT, SMALL, command, run
 
 from cleanrl_thesis import ppo_continuous_kle as ppo
 
@@ -44,6 +45,9 @@ BAD = [
     (["--gamma", "1.5"], ["--gamma", "1.5", "between 0 and 1"]),
     (["--ent-coef", "nan"], ["--ent-coef", "nan"]),
     (["--seed", "-1"], ["--seed", "-1"]),
+    (["--num-threads", "0"], ["--num-threads", "0", "between 1 and 1024"]),
+    (["--num-threads", "99999999999"], ["--num-threads", "99999999999", "between 1 and 1024"]),
+    (["--exp-name", "../elsewhere"], ["--exp-name", "../elsewhere"]),
     (["--stop-at", "0"], ["--stop-at", "0"]),
     (["--checkpoint-interval", "0"], ["--checkpoint-interval", "0"]),
     (["--kl-estimator", "k2"], ["--kl-estimator", "k2", "k3"]),
@@ -302,6 +306,43 @@ def test_weights_and_biases_without_a_login_is_one_line_and_loses_no_result(copi
     done = run(*flags, cwd=tmp_path, code=2, **home)
     assert done.stderr.startswith("error: --track: ") and done.stderr.count("\n") == 1
     assert (copied_run / "result.json").exists()
+
+
+def test_a_run_that_did_not_begin_can_be_sent_again(tmp_path):
+    """Without --resume too: there is nothing to lose but `args.json`."""
+    pytest.importorskip("wandb")
+    home = {"HOME": str(tmp_path), "WANDB_API_KEY": "", "WANDB_MODE": "online"}
+    run(*SMALL, "--track", "--run-dir", "run", cwd=tmp_path, code=2, **home)
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {"args.json", "wandb"}
+    run(*SMALL, "--stop-at", 256, "--run-dir", "run", cwd=tmp_path)
+    assert (tmp_path / "run" / "result.json").exists()
+
+
+def test_too_little_memory_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ppo, "Agent", lambda *its: torch.empty(2**60))
+    assert ppo.cli([*SMALL, "--run-dir", "run"]) == 1
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and err.startswith("error: not enough memory: "), err
+
+
+def test_another_error_of_torch_is_a_bug_and_keeps_its_traceback(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ppo, "Agent", lambda *its: torch.empty(2) + torch.empty(3))
+    with pytest.raises(RuntimeError, match="size of tensor"):
+        ppo.cli([*SMALL, "--run-dir", "run"])
+
+
+def test_the_digest_is_of_the_script_that_ran(tmp_path):
+    """And not of what the file has become when the run ends."""
+    script = tmp_path / "ppo_continuous_kle.py"
+    shutil.copy(SCRIPT, script)
+    digest = hashlib.sha256(script.read_bytes()).hexdigest()
+    process = subprocess.Popen(command(*SMALL, "--run-dir", "run", script=script), cwd=tmp_path, stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"run\n"  # the script has been read
+    script.write_text(script.read_text() + "\n")
+    assert process.wait(timeout=300) == 0
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["script_sha256"] == digest
 
 
 def test_a_name_may_hold_the_word_infinity(tmp_path):

@@ -182,7 +182,7 @@ def test_replay_restores_the_state_of_an_environment(env_id):
             first.start()
     second = ppo.Episode(ppo.make_env(env_id), seed=1, stream=0, gamma=0.99)
     second.replay(first.number, np.array(first.actions))
-    assert second.undiscounted_return == first.undiscounted_return
+    assert second.episodic_return == first.episodic_return
     assert second.discounted_return == first.discounted_return
     for _ in range(60):
         action = rng.uniform(low, high).astype(np.float32)

@@ -1,7 +1,7 @@
 """A wrong value of a flag: one line that names it, exit code 2, and nothing is made. PPO's are in test_command_line.py."""
 
 import pytest
-from conftest import assert_refused
+from conftest import ROOT, assert_refused, run
 
 from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import distill_hybrid as distill
@@ -32,6 +32,7 @@ BAD_DQN = [
 BAD_GOPHER = [
     (["--env-id", "CartPole-v1"], ["--env-id", "CartPole-v1", "ALE/*-v5"]),
     (["--env-id", "ALE/NoSuchGame-v5"], ["--env-id", "NoSuchGame"]),
+    (["--num-threads", 0], ["--num-threads", "0", "between 1 and 1024"]),
     (["--obs-type", "sound"], ["--obs-type", "sound"]),
     (["--total-timesteps", 31], ["--total-timesteps", "31", "32 frames"]),
     (["--buffer-size", 47], ["--buffer-size", "47", "48"]),
@@ -169,3 +170,19 @@ def test_a_wrong_value_is_one_line_and_creates_nothing(module, flags, words, tmp
     monkeypatch.chdir(tmp_path)
     assert_refused(module, capsys, flags, words)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "module, flags",
+    [
+        (dqn, ["--buffer-size", 2_000, "--learning-starts", 1_000]),
+        (gopher, ["--obs-type", "ram", "--buffer-size", 10**6, "--learning-starts", 1_600]),  # larger than the run
+        (gopher, ["--buffer-size", 400, "--learning-starts", 2_400, "--checkpoint-interval", 640]),
+    ],
+)
+def test_the_disk_is_asked_for_as_much_as_the_replay_takes(module, flags, tmp_path, monkeypatch):
+    asked, check = [], module.check_disk
+    monkeypatch.setattr(module, "check_disk", lambda *its: asked.append(its[3]) or check(*its))
+    script = ROOT / "cleanrl_thesis" / f"{module.__name__.split('.')[-1]}.py"
+    run(*flags, "--total-timesteps", 2_560, "--eval-episodes", 1, "--run-dir", "run", cwd=tmp_path, script=script)
+    assert asked == [(tmp_path / "run" / "replay.dat").stat().st_size]
