@@ -26,6 +26,7 @@ from conftest import (
     run,
     sign,
 )
+from scipy import stats
 
 from cleanrl_thesis import distill_hybrid as distill
 from cleanrl_thesis import dqn_apple as dqn
@@ -467,10 +468,30 @@ def test_what_is_tested_on_is_not_trained_on(tmp_path, monkeypatch):
     assert frames(torch.cat([obs[indices], tested[0]])) == frames(obs)
 
 
+def test_adam_gets_the_annealed_rates_and_three_tenths_are_explored(tmp_path, monkeypatch):
+    """Not only the record: an update each 4 frames from frame 1,000 on, and the network's action unless ε is drawn."""
+    rates, played, step, act = [], [], dqn.adam_step, dqn.Player.step
+    monkeypatch.setattr(dqn, "adam_step", lambda *its: rates.append(its[4].item()) or step(*its))
+    monkeypatch.setattr(dqn.Player, "step", lambda its, action, to: played.append(action) or act(its, action, to))
+    monkeypatch.setattr(dqn, "numpy_greedy", lambda agent: lambda obs: np.full(len(obs), 5))
+    flags = ["--total-timesteps", 3_000, "--start-e", 0.3, "--end-e", 0.3, "--run-dir", "run"]
+    run(*SMALL_DQN, *flags, cwd=tmp_path, script=DQN)
+    assert np.allclose(rates, 5e-4 * (1 - np.arange(999, 3_000, 4) / 3_000), rtol=1e-5)
+    counts = np.bincount(played, minlength=9)
+    assert counts.sum() == 3_000 and stats.chisquare(counts, 3_000 * (0.7 * np.eye(9)[5] + 0.3 / 9)).pvalue > 0.001
+
+
+def test_a_linear_schedule_at_a_few_frames():
+    frames = (0, 1, 500, 999, 1_000, 5_000)
+    expected = [1, 1 - 0.9 / 1_000, 0.55, 0.1 + 0.9 / 1_000, 0.1, 0.1]
+    assert [dqn.linear_schedule(1.0, 0.1, 1_000, t) for t in frames] == pytest.approx(expected)
+    assert dqn.linear_schedule(1.0, 0.1, 0, 0) == 0.1
+
+
 def test_exploration_of_the_dqn_falls_over_its_share(tmp_path, monkeypatch):
     """And with ε = 1 the network is never asked."""
-    durations, schedule = set(), dqn.linear_schedule
-    monkeypatch.setattr(dqn, "linear_schedule", lambda *its: durations.add(its[:3]) or schedule(*its))
+    asked, schedule = [], dqn.linear_schedule
+    monkeypatch.setattr(dqn, "linear_schedule", lambda *its: asked.append(its) or schedule(*its))
     flags = ["--total-timesteps", 3_000, "--start-e", 1, "--end-e", 1, "--run-dir", "run"]
 
     def never(agent):
@@ -482,7 +503,7 @@ def test_exploration_of_the_dqn_falls_over_its_share(tmp_path, monkeypatch):
 
     monkeypatch.setattr(dqn, "numpy_greedy", never)
     run(*SMALL_DQN, *flags, cwd=tmp_path, script=DQN)
-    assert durations == {(1.0, 1.0, 0.1 * 3_000)}
+    assert asked == [(1.0, 1.0, 0.1 * 3_000, frame) for frame in range(3_000)]
 
 
 def test_no_game_serves_two_purposes(teacher, student):

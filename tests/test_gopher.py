@@ -265,7 +265,9 @@ def assert_same_run(left: Path, right: Path) -> None:
     for part in ("agent", "target_network"):
         for name, value in states[0][part].items():
             assert torch.equal(value, states[1][part][name]), name
-    for mine, other in zip(*(state["optimizer"]["state"].values() for state in states)):
+    moments = [list(state["optimizer"]["state"].values()) for state in states]
+    assert moments[0]
+    for mine, other in zip(*moments, strict=True):
         assert all(torch.equal(value, other[name]) for name, value in mine.items())
 
 
@@ -301,8 +303,10 @@ def test_a_torn_checkpoint_goes_on_from_the_one_before(small, tmp_path):
     assert_same_run(small, tmp_path / "run")
 
 
-def test_schedules_of_a_run(tmp_path):
-    """ε falls to --end-e over its share of the frames, the learning rate to 0 over all."""
+def test_schedules_of_a_run(tmp_path, monkeypatch):
+    """ε falls to --end-e over its share of the frames, the learning rate to 0 over all, and Adam gets it."""
+    rates, step = [], torch.optim.Adam.step
+    monkeypatch.setattr(torch.optim.Adam, "step", lambda adam: rates.append(adam.param_groups[0]["lr"]) or step(adam))
     flags = [
         *RAM,
         "--total-timesteps",
@@ -319,6 +323,30 @@ def test_schedules_of_a_run(tmp_path):
     frames = updates["global_step"] - 32  # of the step before, which was taken with them
     assert np.allclose(updates["charts/epsilon"], np.maximum(1 - 0.99 * frames / 20_000, 0.01))
     assert np.allclose(updates["charts/learning_rate"], 1e-4 * (1 - frames / 40_000))
+    assert np.allclose(rates, np.repeat(1e-4 * (1 - np.arange(32_000 - 32, 40_000 - 32 + 1, 32) / 40_000), 2))
+
+
+def test_three_tenths_are_explored_and_no_game_is_played_twice(tmp_path, monkeypatch):
+    """Each of four games explores by itself; what it trains on is neither evaluated nor saved as a demonstration."""
+    chosen, seeds, step, reset = [], [], dqn.Players.step, dqn.AtariGame.reset
+
+    def note(game, *, seed=None, options=None):
+        seeds.append(int(seed))
+        return reset(game, seed=seed, options=options)
+
+    monkeypatch.setattr(dqn.AtariGame, "reset", note)
+    monkeypatch.setattr(dqn.Players, "step", lambda its, actions, to: chosen.append(actions) or step(its, actions, to))
+    monkeypatch.setattr(dqn, "greedy_policy", lambda *its: lambda obs: np.full(len(obs), 5))
+    flags = [*SMALL, "--total-timesteps", 8_000, "--learning-starts", 7_999, "--start-e", 0.3, "--end-e", 0.3]
+    run(*flags, "--save-demos", 1, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    is_greedy = np.array(chosen) == 5
+    assert is_greedy.shape == (500, 4)
+    share = 0.7 + 0.3 / 8
+    for part, probability in ((is_greedy, share), (is_greedy.all(1), share**4)):
+        assert stats.binomtest(int(part.sum()), part.size, probability).pvalue > 0.001
+    evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    assert len(evaluation["seeds"]) == 2 and seeds[-3:-1] == evaluation["seeds"]
+    assert len(seeds) >= 4 + 3 and len(set(seeds)) == len(seeds)
 
 
 def test_a_run_on_pixels_stops_and_goes_on(tmp_path):
@@ -614,17 +642,21 @@ def test_a_stopped_student_of_gopher_ends_with_the_same_bytes(student, pixel_tea
     assert evaluation["sampled"]["rewards_per_life"]["episodes"] >= 3
 
 
-def test_a_finished_student_is_not_prepared_again(student, tmp_path, capsys):
+def test_a_finished_student_is_not_prepared_again(student, tmp_path, monkeypatch, capsys):
     """It is told before the teacher is read and anything is played; and so is that a folder is taken."""
     args = json.loads((student / "args.json").read_text())
     flags = [*SMALL_DISTILL, "--teacher", args["teacher"], "--bf16", "--save-model", "--save-demos", 1]
     for name in ("run", "taken"):  # a process keeps its lock
         shutil.copytree(student, tmp_path / name)
-    begin = time.perf_counter()
+
+    def never(*its, **named):
+        raise AssertionError("prepared")
+
+    for name in ("read_human", "load_teacher", "play_atari", "watch", "Update"):
+        monkeypatch.setattr(distill, name, never)
     assert distill.cli([*map(str, flags), "--run-dir", str(tmp_path / "run"), "--resume"]) == 0
     assert f"{tmp_path / 'run'} is done" in capsys.readouterr().out
     assert_refused(distill, capsys, [*flags, "--run-dir", tmp_path / "taken"], ["--run-dir", "exists"])
-    assert time.perf_counter() - begin < 3
 
 
 def test_recordings_of_gopher_are_played_again_and_learned_from(student, pixel_teacher, tmp_path):
