@@ -302,12 +302,11 @@ def test_a_resume_with_other_hyperparameters_names_them(student, expert, tmp_pat
     assert_refused(gail, capsys, flags, ["--gamma 0.9", "was"])
 
 
-def test_a_student_goes_on_with_other_checkpoints(student, expert, tmp_path):
-    """They are no part of the result: the same bytes, from an interval of 1 step and then of 1,000."""
-    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--run-dir", "run", "--resume"]
-    run(*flags, "--stop-at", 1_024, cwd=tmp_path, script=GAIL)
-    run(*flags, "--checkpoint-interval", 1_000, cwd=tmp_path, script=GAIL)
-    assert_same_run(student, tmp_path / "run")
+def test_a_student_goes_on_with_another_interval_between_checkpoints(student, expert, tmp_path):
+    shutil.copytree(student, tmp_path / "run")
+    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--run-dir", "run", "--resume", "--save-model"]
+    done = run(*flags, "--save-demos", 2, "--checkpoint-interval", 1_000, cwd=tmp_path, script=GAIL)
+    assert "is done" in done.stdout
 
 
 @pytest.mark.parametrize("steps", [512, 0])
@@ -393,7 +392,7 @@ def test_the_replay_file_is_as_large_as_the_disk_was_asked_for(tmp_path, monkeyp
 
 
 def test_what_is_replayed(expert, tmp_path):
-    """No value behind a crash, one behind a time-out; rewards times --reward-scale."""
+    """No value behind a crash, one behind a time-out; rewards times --reward-scale. Of Pendulum all that its games give again."""
     discounts = replayed(expert, 2 * 65 + 2 + 2)[:, 65 + 2 + 1]
     crashes = (expert / "episodes.csv").read_text().count("\n") - 1  # 1,600 steps of each car: too few for a time-out
     assert (discounts == 0).sum() == crashes > 0 and np.allclose(discounts[discounts > 0], 0.99)
@@ -402,6 +401,37 @@ def test_what_is_replayed(expert, tmp_path):
     rows, episodes = replayed(tmp_path / "run", 9), ddpg.read_episodes(tmp_path / "run")
     assert np.allclose(rows[:, 5], 0.99) and len(episodes) == 40
     assert rows[:, 4].sum() == pytest.approx(0.1 * episodes[:, 1].sum(), rel=1e-4)
+    assert len(rows) == 1_600 and 0.5 < np.abs(rows[:, 3]).max() <= 1  # actions as the actor gives them
+    env = gym.make("Pendulum-v1")
+    for i in range(5):
+        for t, row in enumerate(rows[i::5]):
+            if t % 40 == 0:  # an episode of 200 steps
+                obs, _ = env.reset(seed=ddpg.episode_seed(1, i, t // 40))
+            assert np.allclose(obs, row[:3], atol=1e-4)
+            rewards = []
+            for _ in range(5):
+                obs, reward, *_ = env.step(2 * row[3:4])
+                rewards.append(reward)
+            assert np.allclose(obs, row[6:], atol=1e-4) and 0.1 * sum(rewards) == pytest.approx(row[4], abs=1e-3)
+
+
+def test_the_normalization_is_of_all_observations_that_were_acted_on(expert):
+    norm = torch.load(expert / "checkpoint.pt", weights_only=True)["norm"]
+    obs = replayed(expert, 2 * 65 + 2 + 2)[:, :65].astype(np.float64)
+    assert norm["count"] == len(obs) > 0
+    expected = [obs.mean(0), np.maximum(obs.std(0), 0.1)]
+    assert np.allclose(norm["scale"], expected, atol=1e-4)
+
+
+def test_adam_gets_the_annealed_rates_of_actor_and_critic(tmp_path, monkeypatch):
+    """Ten iterations of 20 updates."""
+    rates, step = [], ddpg.adam_step
+    at = lambda *its: rates.append((its[4][0].item(), its[4][-1].item())) or step(*its)  # noqa: E731
+    monkeypatch.setattr(ddpg, "adam_step", at)
+    flags = ["--total-timesteps", 1_000, "--keep-best-every", 0, "--run-dir", "run"]
+    run(*SMALL_DDPG, *flags, cwd=tmp_path, script=DDPG)
+    args, remaining = ddpg.Args(), np.repeat(1 - np.arange(10) / 10, 20)[:, None]
+    assert np.allclose(rates, remaining * [args.actor_learning_rate, args.learning_rate], rtol=1e-5)
 
 
 def test_the_experts_are_in_their_places(expert, tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """PPO in FourRooms: its functions against independent sources, and small runs through the command line."""
 
+import itertools
 import json
 import math
 import shutil
@@ -116,6 +117,61 @@ def test_a_rollout_is_what_the_games_gave():
     assert cut_off >= 7 and rollout.episodes == episodes
 
 
+def random_minibatch(rows: int = 32) -> method.Batch:
+    rng = np.random.default_rng(0)
+    frames = torch.from_numpy(rng.integers(0, 256, (rows, 22, 22, 3), np.uint8))
+    numbers = torch.from_numpy(rng.normal(size=(3, rows)).astype(np.float32))
+    return method.Batch(frames, torch.from_numpy(rng.integers(0, 3, rows)), -numbers[0].abs(), *numbers[1:])
+
+
+def test_the_gradient_is_clipped():
+    norms = {}
+    for bound in (1e-3, math.inf):
+        torch.manual_seed(0)
+        agent = method.Agent(22, 3, 4, 16)
+        method.Update(agent, small_args(max_grad_norm=bound))(random_minibatch())
+        norms[bound] = torch.cat([parameter.grad.flatten() for parameter in agent.parameters()]).norm().item()
+    assert norms[1e-3] == pytest.approx(1e-3, rel=1e-2) and norms[math.inf] > 0.01
+
+
+def test_each_pass_takes_every_step_once_in_another_order():
+    """Four minibatches of 32 steps; the metrics are those of the last pass."""
+    args, seen = small_args(update_epochs=3), []
+
+    def update(minibatch: method.Batch) -> torch.Tensor:
+        seen.append(minibatch.actions.tolist())
+        return torch.full((5,), float(len(seen)))
+
+    numbers = torch.arange(128)
+    batch = method.Batch(torch.zeros(128, 1), numbers, numbers + 0.5, numbers.float(), numbers.float())
+    metrics = method.update_agent(update, batch, args)
+    passes = [sum(seen[i : i + 4], []) for i in (0, 4, 8)]
+    assert [len(rows) for rows in seen] == [32] * 12 and all(sorted(order) == list(range(128)) for order in passes)
+    orders = [list(range(128)), *passes]
+    assert all(one != other for one, other in itertools.combinations(orders, 2))
+    assert set(metrics.values()) == {np.mean([9, 10, 11, 12])} and len(metrics) == 5
+
+
+def test_the_agent_has_the_mean_of_the_first_frames(small_run):
+    """Against 20,000 games that begin; the agent's own is exact."""
+    mean = torch.load(small_run / "checkpoint.pt", weights_only=True)["agent"]["obs_mean"].numpy()
+    frames, _ = method.FourRoomsVectorEnv(20_000, 11, 22).reset(seed=5)
+    assert mean.shape == (22, 22, 3) and mean.max() > 50 and np.abs(mean - frames.mean(0)).max() < 2
+
+
+def test_no_game_serves_two_purposes(small_run):
+    """Training, evaluation and demonstrations begin with other seeds."""
+    shown = set()
+    for path in (small_run / "demos").glob("*.npz"):
+        with np.load(path) as arrays:
+            shown.add(int(arrays["seed"]))
+    scored = set(json.loads((small_run / "evaluation.json").read_text())["seeds"])
+    training = {method.episode_seed(1, i, n) for i in range(8) for n in range(1_000)}
+    assert (len(scored), len(shown)) == (5, 3)
+    for one, other in itertools.combinations((training, scored, shown), 2):
+        assert not one & other
+
+
 def test_small_run_leaves_its_records(small_run):
     rows = (small_run / "updates.csv").read_text().splitlines()
     assert len(rows) == 7 and rows[0].startswith("global_step,charts/learning_rate,losses/policy_loss")
@@ -205,11 +261,7 @@ def test_compiled_and_plain_agree(tmp_path):
         agent = method.Agent(args.frame_side, 3, 4, 16)
         update = method.Update(agent, args)
         assert update.is_compiled == compiles
-        rng = np.random.default_rng(0)
-        frames = torch.from_numpy(rng.integers(0, 256, (32, 22, 22, 3), np.uint8))
-        numbers = torch.from_numpy(rng.normal(size=(3, 32)).astype(np.float32))
-        batch = method.Batch(frames, torch.from_numpy(rng.integers(0, 3, 32)), -numbers[0].abs(), *numbers[1:])
-        parts = [update(batch) for _ in range(3)]
+        parts = [update(random_minibatch()) for _ in range(3)]
         results.append((torch.stack(parts), torch.cat([value.detach().flatten() for value in agent.parameters()])))
     assert torch.allclose(results[0][0], results[1][0], atol=1e-4)
     assert torch.allclose(results[0][1], results[1][1], atol=1e-4)
@@ -217,14 +269,11 @@ def test_compiled_and_plain_agree(tmp_path):
 
 def test_bfloat16_and_float32_agree():
     """The same minibatch, the same parameters: policy and values, and the direction of the gradient."""
-    rng, results = np.random.default_rng(0), []
-    frames = torch.from_numpy(rng.integers(0, 256, (32, 22, 22, 3), np.uint8))
-    numbers = torch.from_numpy(rng.normal(size=(3, 32)).astype(np.float32))
-    batch = method.Batch(frames, torch.from_numpy(rng.integers(0, 3, 32)), -numbers[0].abs(), *numbers[1:])
+    batch, results = random_minibatch(), []
     for bf16 in (False, True):
         torch.manual_seed(0)
         agent = method.Agent(22, 3, 8, 32, bf16)
-        made = agent(frames)
+        made = agent(batch.obs)
         assert all(part.dtype == torch.float32 for part in made)
         method.ppo_loss(*made, batch, 0.2, 0.01, 0.5)[0].backward()
         gradient = torch.cat([parameter.grad.flatten() for parameter in agent.parameters()])
