@@ -60,6 +60,15 @@ def make_collector(tmp_path, learner: method.Learner, steps: int = 60) -> method
     return collector
 
 
+def make_data(first: list[list[int]]) -> method.Chunks:
+    """Random chunks; first (B, T) says where episodes begin."""
+    torch.manual_seed(1)
+    begins = torch.tensor(first, dtype=torch.float32).T
+    frames = torch.randint(0, 256, (*begins.shape, 22, 22, 3), dtype=torch.uint8)
+    actions = torch.randint(3, begins.shape) * (1 - begins).long()
+    return method.Chunks(frames, actions, begins, torch.rand(begins.shape), torch.zeros(begins.shape))
+
+
 def wake(module: torch.nn.Module) -> None:
     """Give heads that start at zero something to say."""
     torch.manual_seed(5)
@@ -257,6 +266,31 @@ def test_kl_against_torch_distributions():
     )
 
 
+def test_four_fifths_of_the_kl_gradient_train_the_prior():
+    """In steps without a past, where the prior's weights are in p alone and the posterior's in q alone."""
+    learner, data = make_learner(), make_data([[1, 1], [1, 1]])
+    args, model = learner.args, learner.model
+    args.image_scale = args.reward_scale = args.discount_scale = args.entropy_scale = 0.0
+    weights = model.prior_layers[-1].weight, model.posterior_out.weight
+    torch.manual_seed(2)
+    loss, _, _ = method.world_model_loss(model, data, 10**6)
+    torch.manual_seed(2)
+    embed = model.embedding(model.normalize(data.frames.flatten(0, 1))).unflatten(0, data.first.shape)
+    made = model.observe(embed, F.one_hot(data.actions, 3).float(), data.first)
+    categorical = torch.distributions.OneHotCategorical
+    plain = torch.distributions.kl_divergence(categorical(logits=made.posterior), categorical(logits=made.prior))
+    whole = torch.autograd.grad(plain.sum(-1).mean(), weights)
+    for part, wanted, share in zip(torch.autograd.grad(loss, weights), whole, (0.8, 0.2)):
+        assert wanted.abs().max() > 1e-4 and torch.allclose(part, share * wanted, rtol=1e-3, atol=1e-7)
+
+
+def test_the_weight_of_the_kl_grows_from_a_tenth():
+    args = make_args(kl_warmup=1_000)
+    shares = [method.warm_up(args, updates) for updates in (0, 49, 499, 999, 5_000)]
+    assert shares == pytest.approx([0.1, 0.1, 0.5, 1, 1])
+    assert method.warm_up(make_args(kl_warmup=0, entropy_scale=0.0), 0) == 1
+
+
 def test_an_episode_forgets_the_one_before_and_nothing_of_its_own():
     """`first` masks the state and action before the step at which it stands, not one step early or late."""
     learner = make_learner()
@@ -284,8 +318,9 @@ def test_an_episode_forgets_the_one_before_and_nothing_of_its_own():
     assert torch.equal(after[3, 0], plain[3, 0]) and not torch.equal(after[3, 1], plain[3, 1])
 
 
-def test_loss_is_the_sum_of_its_parts(tmp_path):
-    learner = make_learner(kl_balance=0.5, reward_scale=3.0)
+@pytest.mark.parametrize("tanh", [False, True])
+def test_loss_is_the_sum_of_its_parts(tmp_path, tanh):
+    learner = make_learner(kl_balance=0.5, reward_scale=3.0, tanh_reward=tanh)
     wake(learner.model)
     data = make_collector(tmp_path, learner).replay.sample(CPU)
     data.rewards[2, 1], data.terminals[2, 1] = 0.7, 1.0
@@ -302,13 +337,15 @@ def test_loss_is_the_sum_of_its_parts(tmp_path):
         for b in range(3):
             image += 0.5 * (model.decoder(features[t, b][None])[0] - frames[t, b]).square().sum()
             predicted, goes_on = model.outcome(features[t, b])
-            reward += 0.5 * (predicted - data.rewards[t, b]) ** 2
+            target = np.tanh(data.rewards[t, b].item()) if tanh else data.rewards[t, b]
+            reward += 0.5 * (predicted - target) ** 2
             discount -= torch.log(1 - goes_on if data.terminals[t, b] else goes_on)
             kl += method.kl_categorical(made.posterior[t, b], made.prior[t, b])
             entropy += torch.distributions.OneHotCategorical(logits=made.posterior[t, b]).entropy().sum()
     total = (0.25 * image + 3 * reward + 5 * discount + 0.5 * kl - 0.5 * 0.3 * entropy) / 18  # half of the warm-up
     assert loss.item() == pytest.approx(total.item(), rel=1e-4)
     assert parts["losses/image"].item() == pytest.approx(image.item() / 18, rel=1e-4)
+    assert parts["losses/reward"].item() == pytest.approx(reward.item() / 18, rel=1e-4)
 
 
 def test_frames_are_normalised():
@@ -437,6 +474,51 @@ def test_each_part_has_its_own_rate():
         assert (group["lr"], group["eps"]) == (rate, eps) and group["lr"] * group["weight_decay"] == pytest.approx(1e-4)
 
 
+def norms_of_gradients(learner) -> dict[str, float]:
+    """Of each module after its last step."""
+    return {
+        name: torch.cat([p.grad.flatten() for p in module.parameters() if p.grad is not None]).norm().item()
+        for name, module in learner.modules.items()
+    }
+
+
+def test_each_gradient_is_clipped_by_its_own_norm():
+    norms = []
+    for bound in (np.inf, 0.01):
+        learner = make_learner(max_grad_norm=bound)
+        wake(learner.behaviour)
+        learner.update(make_data([[1, 0, 0, 0, 0, 0]] * 3))
+        norms.append(norms_of_gradients(learner))
+    assert norms[0].keys() == {"model", "actor", "critic"} and min(norms[0].values()) > 0.02
+    assert all(norm == pytest.approx(0.01, rel=1e-3) for norm in norms[1].values())
+
+
+def after_an_update(learner, data) -> torch.Tensor:
+    """All parameters after an update of heads that have something to say, late enough for every schedule to count."""
+    for module in (learner.model.reward, learner.model.discount, learner.behaviour):
+        wake(module)
+    learner.updates = 9
+    torch.manual_seed(6)
+    learner.update(data)
+    modules = learner.model, learner.behaviour
+    return torch.cat([value.flatten() for module in modules for value in module.state_dict().values()])
+
+
+UPDATE_FLAGS = [  # of all three agents
+    *({"starts": 5}, {"horizon": 2}, {"gamma": 0.5}, {"gae_lambda": 0.5}, {"ent_coef": 0.1}, {"slow_interval": 10}),
+    *({"image_scale": 1.0}, {"entropy_scale": 0.0}, {"kl_warmup": 11}, {"kl_balance": 0.5}, {"reward_scale": 1.0}),
+    *({"discount_scale": 1.0}, {"tanh_reward": True}, {"model_learning_rate": 1e-4}, {"actor_learning_rate": 1e-4}),
+    *({"critic_learning_rate": 1e-4}, {"adam_eps": 1e-3}, {"weight_decay": 1e-3}, {"max_grad_norm": 0.01}),
+]
+
+
+@pytest.mark.parametrize("flags", [*UPDATE_FLAGS, {"kl_scale": 0.3}], ids=str)
+def test_every_flag_changes_an_update(flags):
+    data = make_data([[1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [1, 0, 0, 0, 0, 0]])
+    default, changed = (after_an_update(make_learner(**changes), data) for changes in ({}, flags))
+    assert not torch.equal(default, changed)
+
+
 def test_dreams_start_at_states_that_do_not_end_an_episode():
     learner = make_learner(starts=8)
     terminals = torch.zeros(4, 5)
@@ -556,6 +638,17 @@ def test_small_run_leaves_its_records(small_run):
     assert 0 <= evaluation["eval/real_return"] < 1
     for name in ("learning_curve.png", "dream.png"):
         assert (small_run / name).read_bytes()[1:4] == b"PNG"
+
+
+def assert_no_game_of_training_is_scored(folder, method) -> None:
+    """The seeds of its evaluation are none of those with which its games begin, nor any of their streams."""
+    scored = set(json.loads((folder / "evaluation.json").read_text())["seeds"])
+    games = json.loads((folder / "args.json").read_text())["num_envs"]
+    assert scored and not scored & {method.episode_seed(1, game, i) for game in range(games) for i in range(256)}
+
+
+def test_evaluation_plays_no_game_of_the_training(small_run):
+    assert_no_game_of_training_is_scored(small_run, method)
 
 
 def assert_same_states(left, right) -> None:

@@ -184,7 +184,8 @@ def test_posterior_and_prior_boundaries_are_paired_at_the_same_step():
 
 def test_loss_is_the_sum_of_its_terms():
     """Eq. 3.3.5, term by term, with torch.distributions: KL_z where z is read, KL_w at each step."""
-    model, data = make_model(**FAITHFUL, image_scale=2.0), make_data([[5, 4], [9]])
+    changes = FAITHFUL | {"kl_z_scale": 0.7, "kl_w_scale": 0.3, "kl_m_scale": 0.5}
+    model, data = make_model(**changes, image_scale=2.0), make_data([[5, 4], [9]])
     torch.manual_seed(3)
     made = model.infer(data, "train", 0.7)
     torch.manual_seed(3)
@@ -195,7 +196,7 @@ def test_loss_is_the_sum_of_its_terms():
     reconstruction = (data.frames - model.decode(made.belief)).square().sum(-1)  # 0.5 · image_scale = 1
     for name, value in (("kl_z", kl_z), ("kl_w", kl_w), ("reconstruction", reconstruction)):
         assert terms[name].item() == pytest.approx(value.mean().item(), rel=1e-4), name
-    total = terms["reconstruction"] + 0.1 * terms["kl_z"] + 0.1 * terms["kl_w"] + terms["kl_m"]
+    total = terms["reconstruction"] + 0.7 * terms["kl_z"] + 0.3 * terms["kl_w"] + 0.5 * terms["kl_m"]
     assert loss.item() == pytest.approx(total.item(), rel=1e-5)
 
 
@@ -221,18 +222,79 @@ def test_kl_z_prices_the_reads_unless_it_is_detached():
 
 
 def test_prices_of_reads():
-    data = make_data([[9], [9]])
-    torch.manual_seed(4)
-    plain, terms = method.hwm_loss(make_model(budget_price=0.0), data, 1.0, 0.25)
+    """The share above the budget costs its own price beside that of every read."""
+    data, losses = make_data([[9], [9]]), []
+    for prices in ({"budget_price": 0.0}, {"budget_price": 10.0, "read_price": 3.0}):
+        model = make_model(**prices)
+        torch.manual_seed(4)
+        loss, terms = method.hwm_loss(model, data, 1.0, 0.25)
+        losses.append(loss.item())
     rate = terms["read_rate"].item()
-    assert rate > 0.25
+    assert rate > 0.25 and losses[1] - losses[0] == pytest.approx(10 * (rate - 0.25) + 3 * rate, rel=1e-3)
+
+
+@pytest.mark.parametrize("level", ["z", "w", "m"])
+def test_four_fifths_of_each_kl_gradient_train_the_prior(level):
+    """In steps where the prior's weights are in p alone and the posterior's in q alone: without a past, and m of one of two."""
+    scales = {f"kl_{each}_scale": float(each == level) for each in "zwm"}
+    model = make_model(**FAITHFUL | {"image_scale": 1.0, "max_segment_length": 0, "w_reset": True} | scales)
+    model.args.image_scale = 0.0
+    data = make_data([[2]] * 2 if level == "m" else [[1, 1]] * 2)
+    weights = {
+        "z": (model.prior_z.layers[-1].weight, model.posterior_z.layers[-1].weight),
+        "w": (model.prior_w.layers[-1].weight, model.posterior_w.layers[-1].weight),
+        "m": (model.prior_m[-1].weight, model.posterior_m.logit.weight),
+    }[level]
     torch.manual_seed(4)
-    priced, _ = method.hwm_loss(make_model(budget_price=10.0, read_price=3.0), data, 1.0, 0.25)
-    torch.manual_seed(4)  # the model's weights are drawn before the noise
-    plain, _ = method.hwm_loss(make_model(budget_price=0.0), data, 1.0, 0.25)
+    loss, _ = method.hwm_loss(model, data, 1.0, 1.0)
     torch.manual_seed(4)
-    priced, _ = method.hwm_loss(make_model(budget_price=10.0, read_price=3.0), data, 1.0, 0.25)
-    assert priced.item() - plain.item() == pytest.approx(10 * (rate - 0.25) + 3 * rate, rel=1e-3)
+    made = model.infer(data, "train")
+    q = {"z": made.q_z, "w": made.q_w, "m": made.q_m[:1]}[level]
+    p = {"z": model.prior_z(made.updated), "w": model.prior_w(made.belief.h), "m": made.p_m[:1]}[level]
+    normal, bernoulli = torch.distributions.Normal, torch.distributions.Bernoulli
+    pair = (bernoulli(logits=q), bernoulli(logits=p)) if level == "m" else (normal(*q), normal(*p))
+    plain = torch.distributions.kl_divergence(*pair).sum() / 4  # per step
+    whole = torch.autograd.grad(plain, weights)
+    for part, wanted, share in zip(torch.autograd.grad(loss, weights), whole, (0.8, 0.2)):
+        assert wanted.abs().max() > 1e-5 and torch.allclose(part, share * wanted, rtol=1e-3, atol=1e-7)
+
+
+def after_a_step(data: method.Sequence, **changes) -> tuple[torch.Tensor, float]:
+    """The parameters after a training step, and the norm of its gradient."""
+    args = make_args(**{"batch_size": 4, "chunk_length": 8, "total_updates": 20, "budget_updates": 9, **changes})
+    torch.manual_seed(0)
+    model, optimizer = method.new_model(args, np.zeros(7), 3, torch.device("cpu"))
+    torch.manual_seed(1)
+    method.train_step(model, optimizer, data, 10)
+    gradient = torch.cat([p.grad.flatten() for p in model.parameters() if p.grad is not None])
+    return torch.cat([p.detach().flatten() for p in model.parameters()]), gradient.norm().item()
+
+
+def one_sequence() -> method.Sequence:
+    return method.Sequence(*(column[:, 0] for column in make_data([[9] * 10])))
+
+
+def test_the_gradient_is_clipped_by_its_norm():
+    data = one_sequence()
+    assert after_a_step(data, max_grad_norm=math.inf)[1] > 0.1
+    assert after_a_step(data, max_grad_norm=0.01)[1] == pytest.approx(0.01, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        *({"batch_size": 3}, {"chunk_length": 7}, {"learning_rate": 1e-3}, {"max_grad_norm": 0.01}, {"std_bias": -3.0}),
+        *({"image_scale": 1.0}, {"kl_z_scale": 1.0}, {"kl_w_scale": 1.0}, {"kl_m_scale": 1.0}, {"kl_balance": 0.5}),
+        *({"detach_kl_z": False}, {"temperature": 0.5}, {"boundary_bound": 3.0}, {"read_bias": 1.0}, {"budget": 1.0}),
+        *({"max_segment_length": 1}, {"max_segments": 1}, {"w_reset": False}, {"narrow_w": False}, {"narrow_std": 0.2}),
+        *({"c_sees_w": False}, {"decoder_sees_h": True}, {"decoder_sees_c": True}, {"read_price": 1.0}),
+        *({"budget_price": 1.0}, {"budget_updates": 15}, {"surprise_price": 1.0}, {"foretell_copies": 0.1}),
+    ],
+    ids=str,
+)
+def test_every_flag_changes_a_training_step(flags):
+    data = one_sequence()
+    assert not torch.equal(after_a_step(data)[0], after_a_step(data, **flags)[0])
 
 
 @pytest.mark.parametrize("budget", [0.1, 0.9])

@@ -1,6 +1,7 @@
 """HWM Dreamer: its model against independent sources, and small runs. What it shares with the baseline is tested there."""
 
 import csv
+import importlib
 import json
 import sys
 
@@ -9,7 +10,15 @@ import pytest
 import torch
 import torch.nn.functional as F
 from conftest import ROOT, assert_boundaries_follow_their_logits, beliefs_of_play, kill_twice, needs_compiler, run
-from test_dreamer import assert_same_states
+from test_dreamer import (
+    UPDATE_FLAGS,
+    after_an_update,
+    assert_no_game_of_training_is_scored,
+    assert_same_states,
+    make_data,
+    norms_of_gradients,
+    wake,
+)
 
 from cleanrl_thesis import dreamer_v2
 from cleanrl_thesis import hwm_dreamer as method
@@ -45,13 +54,8 @@ def make_model(**changes) -> method.HWM:
     return method.HWM(make_args(**changes), 3)
 
 
-def make_data(first: list[list[int]]) -> method.Chunks:
-    """Random chunks; first (B, T) says where episodes begin."""
-    torch.manual_seed(1)
-    begins = torch.tensor(first, dtype=torch.float32).T
-    frames = torch.randint(0, 256, (*begins.shape, 22, 22, 3), dtype=torch.uint8)
-    actions = torch.randint(3, begins.shape) * (1 - begins).long()
-    return method.Chunks(frames, actions, begins, torch.rand(begins.shape), torch.zeros(begins.shape))
+def make_learner(**changes) -> method.Learner:
+    return method.Learner(make_args(**changes), make_model(**changes), CPU)
 
 
 def one_hot(actions: torch.Tensor) -> torch.Tensor:
@@ -230,11 +234,75 @@ def test_boundaries_see_no_ends_of_chunks():
     assert model.posterior_m(embed + torch.randn_like(embed), data.first).std() > 0
 
 
+@pytest.mark.parametrize("script", ["hwm_dreamer", "hwm_hrl_dreamer"])
 @pytest.mark.parametrize("classes", [1, 4])
-def test_loss_is_the_sum_of_its_terms(classes):
+@pytest.mark.parametrize("level", ["z", "w", "m"])
+def test_four_fifths_of_each_kl_gradient_train_the_prior(script, classes, level):
+    """In steps where the prior's weights are in p alone and the posterior's in q alone: without a past, and m of one of two."""
+    agent = importlib.import_module(f"cleanrl_thesis.{script}")
+    scales = {f"kl_{each}_scale": float(each == level) for each in "zwm"}
+    torch.manual_seed(0)
+    model = agent.HWM(agent.complete_args(agent.Args(**TINY | {"classes": classes, "budget_price": 0.0} | scales)), 3)
+    args, data = model.args, make_data([[1, 0 if level == "m" else 1]] * 2)
+    args.image_scale = args.reward_scale = args.discount_scale = args.entropy_scale = 0.0
+    weights = {
+        "z": (model.prior_z.outer.weight, model.posterior_z.outer.weight),
+        "w": (model.prior_w.outer.weight, model.posterior_w.outer.weight),
+        "m": (model.prior_m[-1].weight, model.posterior_m.logit.weight),
+    }[level]
+    torch.manual_seed(2)
+    loss, _, _ = agent.world_model_loss(model, data, 10**6)
+    torch.manual_seed(2)
+    embed = model.embedding(model.normalize(data.frames.flatten(0, 1))).unflatten(0, data.first.shape)
+    made = model.observe(embed, one_hot(data.actions), data.first, args.temperature)
+
+    def of(given):
+        if level == "m":
+            return torch.distributions.Bernoulli(logits=given)
+        return (
+            torch.distributions.Normal(*given)
+            if classes == 1
+            else torch.distributions.OneHotCategorical(given[0].exp())
+        )
+
+    q = {"z": made.q_z, "w": made.q_w, "m": made.q_m[:-1]}[level]
+    p = {"z": model.prior_z(made.belief.c), "w": model.prior_w(made.belief.h), "m": made.p_m}[level]
+    plain = torch.distributions.kl_divergence(of(q), of(p))
+    whole = torch.autograd.grad((plain if level == "m" else plain.sum(-1)).mean(), weights)
+    for part, wanted, share in zip(torch.autograd.grad(loss, weights), whole, (0.8, 0.2)):
+        assert wanted.abs().max() > 1e-5 and torch.allclose(part, share * wanted, rtol=1e-3, atol=1e-7)
+
+
+def test_each_gradient_is_clipped_by_its_own_norm():
+    norms = []
+    for bound in (np.inf, 0.001):
+        learner = make_learner(max_grad_norm=bound)
+        wake(learner.behaviour)
+        learner.update(make_data([[1, 0, 0, 0, 0, 0]] * 3))
+        norms.append(norms_of_gradients(learner))
+    assert min(norms[0].values()) > 0.002 and all(norm == pytest.approx(0.001, rel=0.01) for norm in norms[1].values())
+
+
+HWM_FLAGS = [
+    *({"kl_z_scale": 0.5}, {"kl_w_scale": 0.5}, {"kl_m_scale": 1.0}, {"detach_kl_z": False}, {"temperature": 0.5}),
+    *({"boundary_bound": 3.0}, {"read_bias": 1.0}, {"w_reset": True}, {"c_sees_w": False}, {"decoder_sees_h": False}),
+    *({"decoder_sees_c": False}, {"budget": 1.0}, {"budget_price": 1.0}, {"budget_updates": 20}, {"fixed_interval": 2}),
+]
+
+
+@pytest.mark.parametrize("flags", [*UPDATE_FLAGS, *HWM_FLAGS, {"classes": 1}], ids=str)
+def test_every_flag_changes_an_update(flags):
+    data = make_data([[1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [1, 0, 0, 0, 0, 0]])
+    changes = ({}, flags) if flags != {"classes": 1} else (flags, {**flags, "std_bias": -2.0})  # of normal variables
+    default, changed = (after_an_update(make_learner(**{"budget_updates": 10, **each}), data) for each in changes)
+    assert not torch.equal(default, changed)
+
+
+@pytest.mark.parametrize(("classes", "tanh"), [(1, True), (4, False)])
+def test_loss_is_the_sum_of_its_terms(classes, tanh):
     """Eq. 3.3.5 and J_R by torch.distributions; m_t pairs with the action that followed step t."""
     changes = {"kl_balance": 0.5, "kl_warmup": 1_000, "kl_z_scale": 0.7, "kl_w_scale": 0.3, "budget_price": 0.0}
-    changes |= {"classes": classes, "budget_updates": 1}
+    changes |= {"classes": classes, "budget_updates": 1, "tanh_reward": tanh}
     model, data = make_model(**changes), make_data([[1, 0, 0, 0, 0, 0], [1, 0, 1, 0, 0, 0], [1, 0, 0, 0, 0, 1]])
     data.terminals[1, 1] = 1
     torch.manual_seed(4)
@@ -269,7 +337,8 @@ def test_loss_is_the_sum_of_its_terms(classes):
                 p_m = model.prior_m(torch.cat([*here[:4], one_hot(data.actions[t + 1, b])[None]], -1))[0, 0]
                 total += 0.3 * kl(bernoulli(logits=made.q_m[t, b]), bernoulli(logits=p_m)) * 18 / 15  # a mean of 5 × 3
             reward, goes_on = model.outcome(here.features()[0])
-            total += 10 * 0.5 * (reward - data.rewards[t, b]) ** 2
+            target = np.tanh(data.rewards[t, b].item()) if tanh else data.rewards[t, b]
+            total += 10 * 0.5 * (reward - target) ** 2
             total -= 5 * torch.log(1 - goes_on if data.terminals[t, b] else goes_on)
     assert loss.item() == pytest.approx(total.item() / 18, rel=1e-4)
     assert all(torch.equal(a, b) for a, b in zip(belief, made.belief))
@@ -333,6 +402,10 @@ def test_small_run_leaves_its_records(small_run):
     assert result["complete"] and result["updates"] == 50
     for name in ("learning_curve.png", "dream.png"):
         assert (small_run / name).read_bytes()[1:4] == b"PNG"
+
+
+def test_evaluation_plays_no_game_of_the_training(small_run):
+    assert_no_game_of_training_is_scored(small_run, method)
 
 
 def test_same_seed_same_bytes(small_run, tmp_path):

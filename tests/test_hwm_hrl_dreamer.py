@@ -10,8 +10,15 @@ import pytest
 import torch
 import torch.nn.functional as F
 from conftest import ROOT, kill_twice, needs_compiler, run
-from test_dreamer import assert_same_states
-from test_hwm_dreamer import SMALL, TINY, make_data
+from test_dreamer import (
+    after_an_update,
+    assert_no_game_of_training_is_scored,
+    assert_same_states,
+    make_data,
+    norms_of_gradients,
+    wake,
+)
+from test_hwm_dreamer import SMALL, TINY
 
 from cleanrl_thesis import hwm_hrl_dreamer as method
 
@@ -161,8 +168,9 @@ def test_both_levels_learn_a_corridor():
     assert -1e-6 < parts["losses/skill_usage_entropy"] <= np.log(3) + 1e-5
 
 
-def test_losses_of_the_high_level_count_decisions_only():
-    """Eq. 3.3.16 and 3.3.17 by a loop over the decisions, weighed by how likely the dream comes to them."""
+def test_losses_of_both_levels():
+    """Eq. 3.3.14 and 3.3.15 by a loop over the steps, Eq. 3.3.16 and 3.3.17 over the decisions, weighed by how likely the dream
+    comes to them."""
     learner = make_learner(num_skills=3)
     torch.manual_seed(3)
     for parameter in learner.behaviour.parameters():
@@ -170,13 +178,24 @@ def test_losses_of_the_high_level_count_decisions_only():
     behaviour = learner.behaviour
     dream = method.imagine(learner.model, behaviour, corridor_starts(), 6, 0.9)
     losses, _ = method.behaviour_loss(behaviour, dream, 0.8, 0.01)
+    assert not torch.equal(
+        behaviour.slow_value(dream.features, dream.skills), behaviour.value(dream.features, dream.skills)
+    )
     with torch.no_grad():
         values, high = behaviour.slow_value(dream.features, dream.skills), behaviour.slow_high_value(dream.features)
         returns = method.high_return(dream.rewards, dream.discounts, dream.decides, high, values[-1], 0.8)
-        actor = critic = number = 0.0
+        actor = critic = number = low_actor = low_critic = 0.0
         for n in range(32):
             weight = 1.0
             for h in range(6):
+                features, skill, target = dream.features[h, n], dream.skills[h, n], values[6, n]
+                for k in reversed(range(h, 6)):
+                    mixed = 0.2 * values[k + 1, n] + 0.8 * target
+                    target = dream.rewards[k, n] + dream.discounts[k, n] * mixed
+                policy = torch.distributions.Categorical(logits=behaviour.policy(features, skill))
+                gain = policy.log_prob(dream.actions[h, n].argmax()) * (target - values[h, n])
+                low_actor -= weight * (gain + 0.01 * policy.entropy())
+                low_critic += weight * 0.5 * (behaviour.value(features, skill) - target) ** 2
                 if dream.decides[h, n]:
                     number += 1
                     log_policy = behaviour.high_policy(dream.features[h, n]).log_softmax(-1)
@@ -185,8 +204,39 @@ def test_losses_of_the_high_level_count_decisions_only():
                     actor -= weight * (chosen * (returns[h, n] - high[h, n]) + 0.01 * entropy)
                     critic += weight * 0.5 * (behaviour.high_value(dream.features[h, n]) - returns[h, n]) ** 2
                 weight *= dream.discounts[h, n]
+    assert losses["actor"].item() == pytest.approx(float(low_actor / (6 * 32)), rel=1e-4)
+    assert losses["critic"].item() == pytest.approx(float(low_critic / (6 * 32)), rel=1e-4)
     assert losses["high_actor"].item() == pytest.approx(float(actor / number), rel=1e-4)
     assert losses["high_critic"].item() == pytest.approx(float(critic / number), rel=1e-4)
+
+
+def make_agent(**changes) -> method.Learner:
+    args = make_args(**changes)
+    torch.manual_seed(0)
+    return method.Learner(args, method.HWM(args, 3), CPU)
+
+
+def test_each_gradient_is_clipped_by_its_own_norm():
+    norms = []
+    for bound in (np.inf, 0.001):
+        learner = make_agent(max_grad_norm=bound)
+        wake(learner.behaviour)
+        learner.update(make_data([[1, 0, 0, 0, 0, 0]] * 3))
+        norms.append(norms_of_gradients(learner))
+    assert norms[0].keys() == {"model", "actor", "critic", "high_actor", "high_critic"}
+    assert min(norms[0].values()) > 0.002 and all(norm == pytest.approx(0.001, rel=0.01) for norm in norms[1].values())
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [{"horizon": 2}, {"gamma": 0.5}, {"gae_lambda": 0.5}, {"ent_coef": 0.1}, {"slow_interval": 10}, {"num_skills": 3}]
+    + [{"actor_learning_rate": 1e-4}, {"critic_learning_rate": 1e-4}, {"adam_eps": 1e-3}, {"max_grad_norm": 0.001}],
+    ids=str,
+)
+def test_every_flag_changes_an_update(flags):
+    data = make_data([[1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [1, 0, 0, 0, 0, 0]])
+    default, changed = (after_an_update(make_agent(**changes), data) for changes in ({}, flags))
+    assert not torch.equal(default, changed)
 
 
 def test_a_dream_without_a_decision_teaches_the_high_level_nothing():
@@ -333,6 +383,10 @@ def test_small_run_leaves_its_records(small_run):
     assert [row["global_step"] for row in rows] == ["1000", "1500"]
     assert float(rows[0]["losses/skill_usage_entropy"]) > 1 and "losses/skill_information" in rows[0]
     assert json.loads((small_run / "result.json").read_text())["updates"] == 50
+
+
+def test_evaluation_plays_no_game_of_the_training(small_run):
+    assert_no_game_of_training_is_scored(small_run, method)
 
 
 def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path):
