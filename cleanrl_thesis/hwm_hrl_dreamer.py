@@ -60,7 +60,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import gymnasium as gym
-import minigrid.envs
+import minigrid
 import numpy as np
 import safetensors.torch
 import torch
@@ -68,9 +68,7 @@ import torch.nn as nn
 import torch.nn.functional as F
 import tyro
 from minigrid.core.grid import Grid
-from minigrid.core.mission import MissionSpace
 from minigrid.core.world_object import Goal, Wall
-from minigrid.minigrid_env import MiniGridEnv
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -356,7 +354,6 @@ DOORS = {  # x, y of the upper, left, right and lower door
     11: ((5, 2), (2, 5), (7, 5), (5, 8)),
     19: ((9, 7), (6, 9), (14, 9), (9, 12)),  # those that MiniGrid draws with seed 0
 }
-LEFT, RIGHT, FORWARD = range(3)
 HEADINGS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])  # x, y of a step forward: MiniGrid's directions 0 to 3
 TILE_SIDE = 32  # pixels of a cell in MiniGrid's picture
 
@@ -517,48 +514,6 @@ def make_info(games: FourRoomsGames) -> dict[str, np.ndarray]:
     return {"state": state, "room": games.maze.rooms[state[:, 0]]}
 
 
-class FourRoomsEnv(minigrid.envs.FourRoomsEnv):
-    """MiniGrid's game in a maze with fixed doors; observations are frames of the whole maze, (side, side, 3) uint8."""
-
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
-
-    def __init__(self, size: int = 11, side: int = 64, render_mode: str | None = None):
-        self.games = FourRoomsGames(size, 1)  # where episodes begin, and the state as numbers
-        self.game, self.painter = np.zeros(1, np.intp), painter(size, side)
-        mission = MissionSpace(mission_func=self._gen_mission)
-        options = {"max_steps": MAX_STEPS, "render_mode": render_mode, "highlight": False}
-        MiniGridEnv.__init__(self, mission, width=size, height=size, **options)
-        self.observation_space, self.action_space = room_frames(side), ROOM_ACTIONS
-        self.games.seed(0, self.np_random)
-
-    def _gen_grid(self, width: int, height: int) -> None:
-        self.games.begin(self.game)
-        cells, (cell, direction, goal) = self.games.maze.cells.tolist(), self.games.state()[0].tolist()
-        self.grid = Grid(width, height)
-        for x, y in np.argwhere(self.games.maze.cell_at < 0).tolist():
-            self.grid.set(x, y, Wall())
-        self.put_obj(Goal(), *cells[goal])
-        self.agent_pos, self.agent_dir = tuple(cells[cell]), direction
-
-    def observe(self) -> tuple[np.ndarray, dict]:
-        """The frame (side, side, 3) of MiniGrid's state, and the state as numbers."""
-        self.games.poses[0] = 4 * self.games.maze.cell_at[tuple(self.agent_pos)] + self.agent_dir
-        info = {name: value[0] for name, value in make_info(self.games).items()}
-        return self.painter.draw(self.games.poses, self.games.goals)[0], info
-
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        if seed is not None:
-            gym.Env.reset(self, seed=seed)
-            self.games.seed(0, self.np_random)
-        super().reset()
-        return self.observe()
-
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
-        _, reward, terminated, truncated, _ = super().step(action)
-        obs, info = self.observe()
-        return obs, float(reward), terminated, truncated, info
-
-
 class FourRoomsVectorEnv(gym.vector.VectorEnv):
     """The same game N times, by tables; a game that ends begins anew within the same step."""
 
@@ -610,13 +565,6 @@ class FourRoomsVectorEnv(gym.vector.VectorEnv):
 
 
 ROOM_SIZES = {"FourRooms11-v0": 11, "FourRooms19-v0": 19}  # cells of the maze's side
-for room_id, room_size in ROOM_SIZES.items():
-    if room_id not in gym.registry:
-        gym.register(room_id, FourRoomsEnv, vector_entry_point=FourRoomsVectorEnv, kwargs={"size": room_size})
-
-
-def make_env(env_id: str, render_mode: str | None = None, side: int = 64) -> gym.Env:
-    return gym.make(env_id, side=side, render_mode=render_mode, disable_env_checker=True)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -1478,7 +1426,7 @@ def set_frame_statistics(model: nn.Module, args: Args) -> None:
 # ---------------------------------------------------------------------------------------------------------------------
 # Playing
 # ---------------------------------------------------------------------------------------------------------------------
-EVALUATION_STREAM, DEMONSTRATION_STREAM = 1_000_000, 1_000_001
+EVALUATION_STREAM = 1_000_000
 
 
 @functools.lru_cache
@@ -1924,7 +1872,7 @@ def record_videos(args: Args, states: np.ndarray, truth: np.ndarray, dream: np.n
     both = np.concatenate([truth, dream], 1).repeat(4, 1).repeat(4, 2)
     (run_dir / "videos").mkdir(exist_ok=True)
     for name, frames in (("episode", episode), ("dream", both)):
-        clip = ImageSequenceClip(list(frames), fps=FourRoomsEnv.metadata["render_fps"])
+        clip = ImageSequenceClip(list(frames), fps=FourRoomsVectorEnv.metadata["render_fps"])
         clip.write_videofile(str(run_dir / "videos" / f"{name}.mp4"), logger=None)
 
 
