@@ -19,7 +19,7 @@ RECORD, STUDY = "record_human.py", "sensitivity_test.py"
 DREAMERS = {  # of all three
     "Collector": "plays with the world model, into the replay",
     "Player": "holds what the world model believes",
-    "make_env": "the side of the frames",
+    "EVALUATION_STREAM": "no demonstrations",
     "play": "keeps what the world model believes",
 }
 DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's two files
