@@ -1861,24 +1861,6 @@ def start_wandb(args: Args, run_dir: Path) -> None:
         raise UsageError(f"--track: {first_line(error)}") from None
 
 
-def run_block(
-    learner: Learner, collector: Collector, args: Args, begin: int
-) -> tuple[list[tuple[int, float, int]], dict[str, float]]:
-    """BLOCK environment steps from step `begin` on, and their updates.
-
-    Returns (step, return, length) of the episodes that ended, and the means of what the updates log.
-    """
-    episodes, logged = [], []
-    for step in range(begin, begin + BLOCK, args.num_envs):
-        ended = collector.step(randomly=step < args.prefill)
-        episodes += [(step + game + 1, value, length) for game, value, length in ended]
-        due = max(0, step + args.num_envs - args.prefill) // args.train_frequency
-        while learner.updates < due:
-            logged.append(learner.update(collector.replay.sample(learner.device)))
-    means = {name: torch.stack([each[name] for each in logged]).mean().item() for name in (logged[0] if logged else {})}
-    return episodes, means
-
-
 def main(args: Args) -> int:
     """Train, evaluate and write everything into the run's folder. Returns the exit code."""
     args = complete_args(args)
@@ -1936,19 +1918,31 @@ def main(args: Args) -> int:
     last_time = time.perf_counter()
 
     while global_step < last_step:
-        episodes, metrics = run_block(learner, collector, args, global_step)
+        returns, logged = [], []
+        for step in range(global_step, global_step + BLOCK, args.num_envs):
+            # act in each game, at random at first; what happens goes into the replay
+            for game, episodic_return, length in collector.step(randomly=step < args.prefill):
+                ended = step + game + 1
+                row = {"global_step": ended, "episodic_return": episodic_return, "episodic_length": length}
+                episodes_csv.write(row)
+                returns.append(episodic_return)
+            # learn from chunks of all that was played: the model, and in its dreams the behaviour
+            due = max(0, step + args.num_envs - args.prefill) // args.train_frequency
+            while learner.updates < due:
+                data = collector.replay.sample(device)
+                logged.append(learner.update(data))  # Eq. 3.3.11
+
         global_step += BLOCK
-        for step, episodic_return, length in episodes:
-            row = {"global_step": step, "episodic_return": episodic_return, "episodic_length": length}
-            episodes_csv.write(row)
-        returns = float(np.mean([value for _, value, _ in episodes])) if episodes else math.nan
-        progress.set_postfix_str(f"return {returns:.3f}", refresh=False)
+        mean_return = float(np.mean(returns)) if returns else math.nan
+        progress.set_postfix_str(f"return {mean_return:.3f}", refresh=False)
         progress.update(BLOCK)
-        if metrics:
+        metrics = {}
+        if logged:
+            metrics = {name: torch.stack([each[name] for each in logged]).mean().item() for name in logged[0]}
             is_due = global_step % COMPARISON == 0
             unknown = {"eval/real_return": math.nan, "eval/dreamed_return": math.nan}
             compared = compare_dream(learner, args) if is_due else unknown
-            metrics = {"charts/episodic_return": returns, **metrics, **compared}
+            metrics = {"charts/episodic_return": mean_return, **metrics, **compared}
             updates_csv.write({"global_step": global_step, **metrics})
             if not all(math.isfinite(value) for name, value in metrics.items() if name.startswith("losses/")):
                 raise RunError(f"step {global_step}: a loss is no longer finite ({metrics})")

@@ -174,16 +174,16 @@ def test_beliefs_in_play_are_those_of_training(tmp_path):
 
 def test_random_play_then_the_policy_and_updates(tmp_path, monkeypatch):
     """Which of the two acts on each side of --prefill, and after how many updates the model's losses are told to be."""
-    learner, calls, counts = make_learner(total_timesteps=2_000, train_frequency=50), [], []
-    collector = make_collector(tmp_path, learner, steps=0)
+    calls, counts = [], []
     for name in ("act", "act_randomly"):
-        plain = getattr(collector.player, name)
-        monkeypatch.setattr(collector.player, name, lambda name=name, plain=plain: calls.append(name) or plain())
+        plain = getattr(method.Player, name)
+        acts = lambda *its, name=name, plain=plain, **more: calls.append(name) or plain(*its, **more)  # noqa: E731
+        monkeypatch.setattr(method.Player, name, acts)
     loss = method.world_model_loss
     monkeypatch.setattr(method, "world_model_loss", lambda *its: counts.append(its[2]) or loss(*its))
-    for begin in (0, 500):
-        method.run_block(learner, collector, learner.args, begin)
-    assert calls == ["act_randomly"] * 50 + ["act"] * 50 and counts == list(range(10))
+    run(*SMALL, "--train-frequency", 50, "--stop-at", 1000, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    assert calls[:100] == ["act_randomly"] * 50 + ["act"] * 50 and counts == list(range(10))
+    assert set(calls[100:]) == {"act"}  # the evaluation
 
 
 def test_the_player_draws_or_takes_the_best():
