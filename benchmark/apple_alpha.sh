@@ -4,22 +4,30 @@
 # Can be sent again after every stop. Two runs at a time: about 3 hours on 2 cores.
 #   benchmark/apple_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/apple_alpha.sh
+#   WORKERS=50 SLURM=benchmark/slurm_template.sh benchmark/apple_alpha.sh     on a cluster; again when the teachers are done, and for the report
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
 FEWER_SEEDS=${FEWER_SEEDS:-$(echo $SEEDS | cut -d " " -f 1-3)}
 ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
 OTHER_ALPHAS=${OTHER_ALPHAS:-0.93 1.0 0.5 0.7 0.8 0.3 0.9}
+code=0
+sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
+  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
+}
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
-  echo "--seed $seed --run-dir $RUNS/teacher_seed$seed"
-done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/dqn_apple.py --compile --save-model --resume
+  echo "teacher_seed$seed --seed $seed"
+done | sweep teachers cleanrl_thesis/dqn_apple.py --compile --save-model
+for seed in $SEEDS; do
+  [ -e "$RUNS/teacher_seed$seed/result.json" ] || { echo "the students wait for $RUNS/teacher_seed$seed"; exit; }
+done
 for seed in $SEEDS; do
   demos="$RUNS/quick_demos_seed$seed"
   [ -e "$demos/manifest.json" ] || "$PYTHON" benchmark/apple_players.py --seed "$seed" --demos "$demos"
 done
-student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
-  echo --seed "$1" --teacher "$RUNS/teacher_seed$1" --alpha "$2" --run-dir "$RUNS/$3_seed$1" "${@:4}"
+student() {  # seed, α, name, more flags
+  echo "$3_seed$1" --seed "$1" --teacher "$RUNS/teacher_seed$1" --alpha "$2" "${@:4}"
 }
 {
   for seed in $SEEDS; do
@@ -44,5 +52,7 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
       done
     done
   done
-} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --compile --save-model --resume
+} | sweep students cleanrl_thesis/distill_hybrid.py --compile --save-model || code=$?
+[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
 "$PYTHON" benchmark/apple_report.py --runs "$RUNS"
+exit "$code"

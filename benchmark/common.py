@@ -1,7 +1,9 @@
 """What the benchmarks share: how they start, published tables, results as CSV, and the commits that results rest on."""
 
+import contextlib
 import csv
 import hashlib
+import io
 import json
 import subprocess
 import sys
@@ -17,10 +19,33 @@ class UsageError(Exception):
     """A wrong value, told in one line; the exit code is 2."""
 
 
+def parse_args(arguments: type, doc: str):
+    """What the command line says. Raises UsageError with one line where tyro prints a box."""
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(arguments, description=doc.split("\n\n")[0])
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [line.strip("│ ") for line in complaint.getvalue().splitlines()]
+        message = " ".join(line for line in lines[1:] if line and line[0] not in "─╰").split("For full helptext")[0]
+        raise UsageError(message.split("Argument helptext")[0].strip()) from None
+
+
+def check_counts(args) -> None:
+    """Raise UsageError where a whole number is less than 1, or a seed less than 0."""
+    for name, value in vars(args).items():
+        least = 0 if name.endswith("seed") else 1
+        if isinstance(value, int) and value < least:
+            raise UsageError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
+
+
 def run_main(main: Callable, arguments: type, doc: str) -> None:
     """Run `main` with what the command line says; a wrong value is one line and exit code 2."""
-    args = tyro.cli(arguments, description=doc.split("\n\n")[0])
     try:
+        args = parse_args(arguments, doc)
+        check_counts(args)
         main(args)
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -5,12 +5,17 @@
 #   STEPS=1100000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 1,100,000 steps
 #   STEPS=1060000 SEEDS=1 AGENTS="dreamer_sharp dreamer_slow dreamer_early dreamer_far dreamer_uniform dreamer_eps" benchmark/fourrooms.sh
 #   SIZE=thesis FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh
+#   WORKERS=20 SLURM=benchmark/slurm_template.sh benchmark/fourrooms.sh     on a cluster; again for the report
 #   KNOWN=benchmark/results/dreamer/xs benchmark/fourrooms.sh    the report goes on from an earlier one whose run folders are gone
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4} AGENTS=${AGENTS:-dreamer hwm hrl hwm_fixed hrl_fixed} SIZE=${SIZE:-xs} ENV_ID=${ENV_ID:-FourRooms11-v0}
 WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/dreamer_$SIZE} FLAGS=${FLAGS---compile}
 INTERVAL=${INTERVAL:-4}
+code=0
+sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
+  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
+}
 script() {  # AGENT: its file and its own flags
   case $1 in
     dreamer) echo dreamer_v2.py ;;
@@ -35,8 +40,10 @@ mkdir -p "$RUNS"
 for seed in $SEEDS; do
   for agent in $AGENTS; do
     read -r file own <<<"$(script "$agent")"
-    echo cleanrl_thesis/$file --env-id "$ENV_ID" --size "$SIZE" --seed "$seed" ${STEPS:+--stop-at $((STEPS - $(less_play "$agent")))} \
-      --run-dir "$RUNS/${agent}_seed$seed" $own $FLAGS
+    echo "${agent}_seed$seed" cleanrl_thesis/$file --env-id "$ENV_ID" --size "$SIZE" --seed "$seed" ${STEPS:+--stop-at $((STEPS - $(less_play "$agent")))} \
+      $own $FLAGS
   done
-done | xargs -P "$WORKERS" -L 1 sh -c '"$0" "$@" --resume' "$PYTHON"
+done | sweep agents || code=$?
+[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
 "$PYTHON" benchmark/dreamer_report.py --runs "$RUNS" ${KNOWN:+--known "$KNOWN"}
+exit "$code"

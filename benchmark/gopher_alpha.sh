@@ -5,6 +5,7 @@
 #   benchmark/gopher_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
 #   THREADS=2 benchmark/gopher_alpha.sh     the teacher with two threads
+#   WORKERS=50 SLURM=benchmark/slurm_template.sh benchmark/gopher_alpha.sh     students on a cluster; again for the report
 #   ALPHAS=0.0 TEMPERATURES= TEACHER= benchmark/gopher_alpha.sh     the human's clones alone, which need no teacher
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -12,6 +13,10 @@ SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} R
 OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1} TEACHER=${TEACHER-$RUNS/teacher_seed1}
 ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
 TEMPERATURES=${TEMPERATURES-0.1 0} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0}
+code=0
+sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
+  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
+}
 mkdir -p "$RUNS"
 if [ -n "$TEACHER" ]; then
   # lives end episodes as in Baselines; targets of three steps stand for its prioritised replay; the rate falls, for the last network
@@ -19,10 +24,10 @@ if [ -n "$TEACHER" ]; then
   OMP_WAIT_POLICY=passive "$PYTHON" cleanrl_thesis/dqn_gopher.py --life-loss-ends --n-step 3 --anneal-lr --bf16 \
     --num-threads "$THREADS" --save-model --eval-episodes 400 --run-dir "$TEACHER" --resume
 fi
-student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
+student() {  # seed, α, name, more flags
   local teacher="--teacher $TEACHER"
   if [ "$2" = 0.0 ]; then teacher=; fi  # a clone of the human
-  echo --seed "$1" --alpha "$2" --run-dir "$RUNS/$3_seed$1" $teacher "${@:4}"
+  echo "$3_seed$1" --seed "$1" --alpha "$2" $teacher "${@:4}"
 }
 {
   for alpha in $ALPHAS; do
@@ -33,6 +38,7 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
       for seed in $SEEDS; do student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"; done
     done
   done
-} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --compile \
-  --save-model --resume
+} | sweep students cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --compile --save-model || code=$?
+[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
 "$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT"
+exit "$code"

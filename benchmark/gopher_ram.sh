@@ -2,12 +2,19 @@
 # Gopher from the console's memory: the runs behind benchmark/results/gopher/ram.md. Can be sent again after every stop.
 #   benchmark/gopher_ram.sh
 #   SEEDS="1" WORKERS=1 benchmark/gopher_ram.sh
+#   WORKERS=3 SLURM=benchmark/slurm_template.sh benchmark/gopher_ram.sh     on a cluster; again for the report
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/gopher_ram}
 FLAGS="--obs-type ram --n-step 3 --life-loss-ends --anneal-lr --total-timesteps 2500000"
+code=0
+sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
+  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
+}
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
-  echo cleanrl_thesis/dqn_gopher.py $FLAGS --seed "$seed" --run-dir "$RUNS/seed$seed"
-done | xargs -P "$WORKERS" -L 1 sh -c '"$0" "$@" --resume' "$PYTHON"
+  echo "seed$seed" --seed "$seed"
+done | sweep ram cleanrl_thesis/dqn_gopher.py $FLAGS || code=$?
+[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
 "$PYTHON" benchmark/gopher_ram.py --runs "$RUNS"
+exit "$code"

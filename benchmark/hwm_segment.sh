@@ -3,10 +3,15 @@
 # the runs behind benchmark/results/hwm_segment/. Can be sent again after every stop.
 #   benchmark/hwm_segment.sh
 #   SEEDS="1" RUNGS="faithful narrow" benchmark/hwm_segment.sh
+#   WORKERS=40 SLURM=benchmark/slurm_template.sh benchmark/hwm_segment.sh     on a cluster; again for the report
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
 RUNGS=${RUNGS:-narrow surprise faithful reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
+code=0
+sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
+  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
+}
 mkdir -p "$RUNS"
 record() {  # DEMOS flags...: episodes of the player stopped at 1,100,000 steps, unless they are there
   [ -e "$PLAYER/$1/manifest.json" ] || "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-model \
@@ -40,7 +45,9 @@ for rung in $RUNGS; do
       ;;
   esac
   for seed in $SEEDS; do
-    echo --demos "$demos" --seed "$seed" --run-dir "$RUNS/${rung}_seed$seed" $flags
+    echo "${rung}_seed$seed" --demos "$demos" --seed "$seed" $flags
   done
-done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/hwm_segment.py --save-model --resume
+done | sweep models cleanrl_thesis/hwm_segment.py --save-model || code=$?
+[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
 "$PYTHON" benchmark/hwm_report.py --runs "$RUNS" ${KNOWN:+--known "$KNOWN"}
+exit "$code"

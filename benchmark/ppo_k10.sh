@@ -2,13 +2,20 @@
 # Plain PPO, K = 10, as run, on six tasks: the runs behind benchmark/results/ppo_k10/. Can be sent again after every stop.
 #   benchmark/ppo_k10.sh            seeds 1 and 2, two runs at a time
 #   SEEDS="1 2 3 4 5" WORKERS=8 benchmark/ppo_k10.sh
+#   WORKERS=8 SLURM=benchmark/slurm_template.sh benchmark/ppo_k10.sh     on a cluster; again for the report
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/ppo_k10}
+code=0
+sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
+  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
+}
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
   for task in Hopper HalfCheetah Walker2d Swimmer Reacher InvertedPendulum; do
-    echo "--env-id kle/$task-v2 --seed $seed --run-dir $RUNS/$task-v2__seed$seed"
+    echo "$task-v2__seed$seed" --env-id "kle/$task-v2" --seed "$seed"
   done
-done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/ppo_continuous_kle.py --compile --checkpoint-interval 200000 --resume
+done | sweep k10 cleanrl_thesis/ppo_continuous_kle.py --compile --checkpoint-interval 200000 || code=$?
+[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
 "$PYTHON" benchmark/ppo_k10_report.py --runs "$RUNS"
+exit "$code"

@@ -171,8 +171,10 @@ def read_runs(folder: Path, steps: int, workers: int) -> list[dict]:
 def read_known(folder: Path, steps: int) -> list[dict]:
     """The runs of an earlier report as `read_runs` gives them; without curves where the report has kept none.
 
-    Raises UsageError where they are not of `steps`.
+    Raises UsageError where there are none, or they are not of `steps`.
     """
+    if not (folder / "runs.csv").is_file():
+        raise UsageError(f"--known {folder}: holds no report, it has no runs.csv")
     curves = dict(np.load(folder / "curves.npz")) if (folder / "curves.npz").exists() else {}
     with open(folder / "runs.csv", newline="") as file:
         rows = [{key: number(key, value) for key, value in row.items()} for row in csv.DictReader(file)]

@@ -321,8 +321,6 @@ def time_dreamer(args: Args) -> None:
 
 
 def main(args: Args) -> None:
-    if args.rounds < 1:
-        raise UsageError(f"--rounds {args.rounds}: must be at least 1")
     if args.sheeprl and args.what != "dreamer":
         raise UsageError(f"--sheeprl {args.sheeprl}: is a peer of `dreamer` only, not of `{args.what}`")
     times = {"ppo": time_ppo, "apple": time_apple, "torcs": time_torcs, "gail": time_gail, "rooms": time_rooms}

@@ -7,16 +7,18 @@
 `{name}.jsonl` in the folder of the runs, the manifest, has a line for each of them. Sent again, the sweep goes on with what
 is not done; a finished run is never run again, also where another sweep in the same folder has finished it. `--stop-at
 STEPS` ends all runs early on their full schedule, and a later sweep without it finishes them. `--slurm-template-path
-benchmark/slurm_template.sh` submits arrays instead, of which `--workers` tasks run at a time.
+benchmark/slurm_template.sh` submits arrays instead, of which `--workers` tasks run at a time. `--lines FILE` has a run on each
+line, its name and its flags, in place of a grid: so the other studies beside this script use it.
 
 The command must understand `--env-id`, `--seed`, `--run-dir`, `--resume` and `--stop-at`, and write a `result.json` at its
-end, as all scripts here do.
+end, as all methods here do (hwm_segment.py has no `--env-id`: its environment is that of the demonstrations).
 """
 
 import fcntl
 import hashlib
 import itertools
 import json
+import math
 import os
 import re
 import shlex
@@ -31,7 +33,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
+from common import UsageError, parse_args
 
 
 @dataclass
@@ -48,6 +50,8 @@ class Args:
     """FLAG=VALUE,VALUE,...: a run for each combination of the values"""
     variants: tuple[str, ...] = ("none",)
     """FLAG,FLAG=VALUE,...: a run with each of these sets of flags; none is the empty one"""
+    lines: Path | None = None
+    """file with the name and the flags of a run on each line, in place of environments, seeds and grid; - for standard input"""
     runs: Path = Path("runs/sweep")
     """folder for the manifest, the runs' folders and logs"""
     name: str = "sweep"
@@ -64,10 +68,6 @@ class Args:
     """tasks in an array; Slurm's default limit is 1,001"""
     only: int | None = None
     """run this line of the manifest alone, from 0 on; for the tasks of an array"""
-
-
-class UsageError(Exception):
-    """A user's mistake, told in one line; the exit code is 2."""
 
 
 def require(holds: bool, complaint: str) -> None:
@@ -123,16 +123,32 @@ def slug(text: str) -> str:
 
 
 def make_runs(args: Args) -> list[Run]:
-    """All runs, seeds outermost: whatever part is done has every setting. Raises UsageError."""
-    command, axes = shlex.split(args.command), parse_grid(args.grid)
-    require(bool(command), "--command: give interpreter, script and the flags that all runs share, in quotes")
-    require(bool(args.env_ids), "--env-ids: name at least one environment")
+    """All runs, in the order in which they are started. Raises UsageError."""
+    require(
+        bool(shlex.split(args.command)),
+        "--command: give interpreter, script and the flags that all runs share, in quotes",
+    )
     require(slug(args.name) == args.name, f"--name {args.name}: must be letters, digits and any of . = -")
     for name, least in (("num_seeds", 1), ("start_seed", 0), ("workers", 1), ("retries", 0), ("slurm_chunk", 1)):
         value = getattr(args, name)
         require(value >= least, f"--{name.replace('_', '-')} {value}: must be at least {least}")
     require(args.stop_at is None or args.stop_at >= 1, f"--stop-at {args.stop_at}: must be at least 1")
-    seeds = range(args.start_seed, args.start_seed + args.num_seeds)
+    runs = grid_runs(args) if args.lines is None else line_runs(args)
+    name, number = Counter(run.name for run in runs).most_common(1)[0]
+    flags = "--env-ids, --grid, --variants" if args.lines is None else f"--lines {args.lines}"
+    require(number == 1, f"{flags}: {number} runs would have the folder {name}")
+    return runs
+
+
+def make_run(args: Args, name: str, flags: list[str]) -> Run:
+    words = [*shlex.split(args.command), *flags]
+    return Run(name, (*words, "--run-dir", str(args.runs / name), "--resume"))
+
+
+def grid_runs(args: Args) -> list[Run]:
+    """A run for each environment, seed and setting; seeds outermost: whatever part is done has every setting. Raises UsageError."""
+    require(bool(args.env_ids), "--env-ids: name at least one environment")
+    axes, seeds = parse_grid(args.grid), range(args.start_seed, args.start_seed + args.num_seeds)
     runs = []
     for seed, variant, values, env_id in itertools.product(
         seeds, args.variants, itertools.product(*axes), args.env_ids
@@ -140,11 +156,22 @@ def make_runs(args: Args) -> list[Run]:
         setting = ["" if variant == "none" else variant, *(f"{flag}={value}" for flag, value in values)]
         name = "__".join(slug(part) for part in (env_id, *setting, f"seed{seed}") if part)
         flags = [word for flag, value in values for word in (f"--{flag}", value)] + parse_variant(variant)
-        words = [*command, "--env-id", env_id, "--seed", str(seed), *flags]
-        runs.append(Run(name, (*words, "--run-dir", str(args.runs / name), "--resume")))
-    name, number = Counter(run.name for run in runs).most_common(1)[0]
-    require(number == 1, f"--env-ids, --grid, --variants: {number} runs would have the folder {name}")
+        runs.append(make_run(args, name, ["--env-id", env_id, "--seed", str(seed), *flags]))
     return runs
+
+
+def line_runs(args: Args) -> list[Run]:
+    """The runs of `--lines`. Raises UsageError."""
+    require(not args.env_ids and not args.grid, f"--lines {args.lines}: is in place of --env-ids and --grid")
+    try:
+        text = sys.stdin.read() if str(args.lines) == "-" else args.lines.read_text()
+        lines = [shlex.split(line) for line in text.splitlines() if line.strip()]
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--lines {args.lines}: cannot be read: {error}") from None
+    require(bool(lines), f"--lines {args.lines}: holds no run")
+    strange = next((name for name, *_ in lines if not re.fullmatch(r"[\w.=-]+", name)), None)
+    require(strange is None, f"--lines {args.lines}: {strange}: must be the name of a folder")
+    return [make_run(args, name, flags) for name, *flags in lines]
 
 
 def manifest_path(args: Args) -> Path:
@@ -160,6 +187,19 @@ def read_manifest(path: Path) -> list[Run]:
         raise UsageError(f"{path}: no readable manifest: {error}") from None
 
 
+def check_begun(args: Args, runs: list[Run], manifests: dict[Path, list[Run]]) -> None:
+    """Raise UsageError unless all that was begun in the folder belongs to this sweep, or to another that is known."""
+    path = manifest_path(args)
+    begun = [run for run in manifests.get(path, []) if (args.runs / run.name).exists()]
+    differs = f"{path}: is of another sweep, which has begun {len(begun)} runs; give another --name or --runs"
+    require(not begun, differs)
+    known = {run.name: (run.command, other) for other, old in manifests.items() if other != path for run in old}
+    for run in runs:
+        if (args.runs / run.name).exists():
+            command, other = known.get(run.name, ((), path))
+            require(command == run.command, f"{args.runs / run.name}: {other} has no such run; give another --runs")
+
+
 def open_manifest(args: Args, runs: list[Run]) -> None:
     """Write the manifest, unless it is there. Raises UsageError where runs were begun otherwise, or cannot begin."""
     require(args.runs.is_dir() or not args.runs.exists(), f"--runs {args.runs}: must be a folder")
@@ -169,14 +209,8 @@ def open_manifest(args: Args, runs: list[Run]) -> None:
     manifests = {other: read_manifest(other) for other in sorted(args.runs.glob("*.jsonl"))}
     if manifests.get(path) == runs:
         return
-    begun = [run for run in manifests.pop(path, []) if (args.runs / run.name).exists()]
-    differs = f"{path}: is of another sweep, which has begun {len(begun)} runs; give another --name or --runs"
-    require(not begun, differs)
-    known = {run.name: (run.command, other) for other, old in manifests.items() for run in old}
-    for run in runs:
-        if (args.runs / run.name).exists():
-            command, other = known.get(run.name, ((), path))
-            require(command == run.command, f"{args.runs / run.name}: {other} has no such run; give another --runs")
+    if args.lines is None:  # lines may change, and each run compares its arguments itself
+        check_begun(args, runs, manifests)
     args.runs.mkdir(parents=True, exist_ok=True)
     draft = path.with_suffix(".tmp")
     with open(draft, "w") as file:
@@ -194,9 +228,11 @@ def read_result(folder: Path) -> dict | None:
         return None
 
 
-def is_done(result: dict | None, stop_at: int | None) -> bool:
-    """Whether a run has come to the end of its schedule, or to `stop_at`."""
-    return result is not None and (result["complete"] or stop_at is not None and result["global_step"] >= stop_at)
+def is_done(args: Args, run: Run, result: dict | None) -> bool:
+    """Whether a run has come to the end of its schedule, or to its `--stop-at`."""
+    words = command_of(args, run)
+    stop_at = int(words[words.index("--stop-at") + 1]) if "--stop-at" in words else math.inf
+    return result is not None and (result["complete"] or result["global_step"] >= stop_at)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -227,7 +263,7 @@ def begin_sweep(args: Args, runs: list[Run]) -> Sweep:
     sweep = Sweep()
     for run in runs:
         result = read_result(args.runs / run.name)
-        if is_done(result, args.stop_at):
+        if is_done(args, run, result):
             count_done(sweep, run, result)
         else:
             sweep.waiting.append(run)
@@ -242,7 +278,9 @@ def count_done(sweep: Sweep, run: Run, result: dict) -> None:
 
 
 def command_of(args: Args, run: Run) -> list[str]:
-    return [*run.command, *(["--stop-at", str(args.stop_at)] if args.stop_at is not None else [])]
+    """The words that start a run; one that has a `--stop-at` of its own keeps it."""
+    words = ["--stop-at", str(args.stop_at)] if args.stop_at is not None and "--stop-at" not in run.command else []
+    return [*run.command, *words]
 
 
 def log_path(args: Args, run: Run) -> Path:
@@ -280,7 +318,7 @@ def settle(args: Args, sweep: Sweep, run: Run, code: int) -> bool:
     del sweep.running[run]
     result = read_result(args.runs / run.name)
     is_busy = code == 2 and BUSY in log_end(args, run, 1)
-    if code == 0 and is_done(result, args.stop_at):
+    if code == 0 and is_done(args, run, result):
         count_done(sweep, run, result)
     elif is_busy or sweep.stopped:
         sweep.waiting.append(run)
@@ -445,7 +483,7 @@ def run_only(args: Args) -> int:
     runs = read_manifest(manifest_path(args))
     require(0 <= args.only < len(runs), f"--only {args.only}: the manifest has lines 0 to {len(runs) - 1}")
     run = runs[args.only]
-    if is_done(read_result(args.runs / run.name), args.stop_at):
+    if is_done(args, run, read_result(args.runs / run.name)):
         print(f"{run.name} is done")
         return 0
     os.environ.update(THREADS)
@@ -487,7 +525,7 @@ def free_job_name(args: Args) -> str:
 
 def submit(args: Args, runs: list[Run], job_name: str) -> int:
     """Submit what is not done as arrays of at most `--slurm-chunk` tasks, one after the other. Raises UsageError."""
-    left = [i for i, run in enumerate(runs) if not is_done(read_result(args.runs / run.name), args.stop_at)]
+    left = [i for i, run in enumerate(runs) if not is_done(args, run, read_result(args.runs / run.name))]
     template = args.slurm_template_path.read_text()
     for part in ("slurm", "logs"):
         (args.runs / part).mkdir(exist_ok=True)
@@ -526,7 +564,7 @@ def main(args: Args) -> int:
 
 def cli() -> int:
     try:
-        return main(tyro.cli(Args, description=__doc__.split("\n\n")[0]))
+        return main(parse_args(Args, __doc__))
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

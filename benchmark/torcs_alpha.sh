@@ -4,22 +4,28 @@
 # runs behind benchmark/results/torcs/. Can be sent again after every stop. An expert takes 0.9 GB of disk.
 #   benchmark/torcs_alpha.sh
 #   SEEDS="1" MORE_SEEDS="" ALPHAS="0.5" WORKERS=1 OUT=runs/first_look benchmark/torcs_alpha.sh
+#   WORKERS=50 SLURM=benchmark/slurm_template.sh benchmark/torcs_alpha.sh     on a cluster; again when the experts are done, and for the report
 set -euo pipefail
 cd "$(dirname "$0")/.."
 EXPERTS=${EXPERTS:-1 2} SEEDS=${SEEDS:-1 2 3} MORE_SEEDS=${MORE_SEEDS-4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/torcs}
 OUT=${OUT:-benchmark/results/torcs}
 ALPHAS=${ALPHAS:-0.5 0.0 1.0 0.7 0.3 0.9 0.1 0.8 0.2 0.6 0.4}
 MIXED=${MIXED:-0.5 0.0 1.0}
+code=0
+sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
+  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
+}
 mkdir -p "$RUNS"
 for seed in $EXPERTS; do
-  echo "--seed $seed --run-dir $RUNS/expert_seed$seed"
-done | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220 --resume
+  echo "expert_seed$seed --seed $seed"
+done | sweep experts cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220
+[ -e "$RUNS/expert_seed${EXPERTS%% *}/result.json" ] || { echo "the students wait for $RUNS/expert_seed${EXPERTS%% *}"; exit; }
 for seed in $SEEDS $MORE_SEEDS; do
   human="$RUNS/human_seed$seed"
   [ -e "$human/manifest.json" ] || "$PYTHON" benchmark/torcs_players.py --seed "$seed" --demos "$human"
 done
-student() {  # seed, α, name, more flags; a line must not end in a blank, or xargs joins it to the next
-  echo --seed "$1" --alpha "$2" --demos-rl "$RUNS/expert_seed${EXPERTS%% *}/demos" --demos-human "$RUNS/human_seed$1" --run-dir "$RUNS/$3_seed$1" "${@:4}"
+student() {  # seed, α, name, more flags
+  echo "$3_seed$1" --seed "$1" --alpha "$2" --demos-rl "$RUNS/expert_seed${EXPERTS%% *}/demos" --demos-human "$RUNS/human_seed$1" "${@:4}"
 }
 {
   for alpha in $MIXED; do
@@ -38,5 +44,7 @@ student() {  # seed, α, name, more flags; a line must not end in a blank, or xa
     student "$seed" 0.5 noanneal_alpha0.5 --no-anneal-kl
     student "$seed" 0.5 fisher1_alpha0.5 --fisher-every 1
   done
-} | xargs -P "$WORKERS" -L 1 "$PYTHON" cleanrl_thesis/gail_hybrid.py --save-model --save-demos 20 --eval-episodes 100 --resume
+} | sweep students cleanrl_thesis/gail_hybrid.py --save-model --save-demos 20 --eval-episodes 100 || code=$?
+[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
 "$PYTHON" benchmark/torcs_report.py --runs "$RUNS" --expert "${EXPERTS%% *}" --out "$OUT"
+exit "$code"

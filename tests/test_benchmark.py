@@ -91,6 +91,23 @@ def test_a_wrong_value_is_one_line_and_exit_code_2(words, complaint, monkeypatch
     assert stop.value.code == 2 and err.startswith(f"error: {complaint}: ") and err.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    "module, words, complaint",
+    [
+        (speed, ["ppo", "--rounds", "x"], "--rounds"),
+        (speed, ["chess"], "chess"),
+        (report, ["--workers", "0"], "--workers 0: must be at least 1"),
+        (report, ["--known", "no/such/folder"], "--known no/such/folder"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(module, words, complaint, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["script.py", *words])
+    with pytest.raises(SystemExit) as stop:
+        run_main(module.main, module.Args, module.__doc__)
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and err.startswith("error: ") and complaint in err and err.count("\n") == 1
+
+
 def test_speed_table_has_medians_and_ratios_round_by_round():
     speeds = {"stable-baselines3": [100.0, 200.0, 150.0], "plain": [400.0, 600.0, 300.0]}
     ratio = {name: [a / b for a, b in zip(values, speeds["stable-baselines3"])] for name, values in speeds.items()}

@@ -369,3 +369,102 @@ def test_arrays_are_submitted_in_chunks_of_what_is_not_done(tmp_path, monkeypatc
         )
         assert "still queued" in err
     assert json.loads((tmp_path / "runs" / "more.jsonl").read_text().splitlines()[0])["name"] == "A-v0__bonus=0__seed1"
+
+
+# The studies beside it, which give it their runs as lines
+STAND_IN = """#!{python}
+import json, os, sys
+from pathlib import Path
+if sys.argv[1] == "benchmark/sweep.py":
+    os.execv({python!r}, [{python!r}, *sys.argv[1:]])
+with open({calls!r}, "a") as file:
+    file.write(json.dumps(sys.argv[1:]) + "\\n")
+if "--run-dir" in sys.argv:
+    run_dir = Path(sys.argv[sys.argv.index("--run-dir") + 1])
+    run_dir.mkdir(parents=True)
+    (run_dir / "result.json").write_text(json.dumps({{"complete": True, "global_step": 0}}))
+"""
+
+
+def study(script: str, folder: Path, **settings: str) -> list[list[str]]:
+    """The command lines that a study sends, from a Python that only writes them down."""
+    python = folder / "python"
+    python.write_text(STAND_IN.format(python=sys.executable, calls=str(folder / "calls")))
+    python.chmod(0o755)
+    env = {
+        **os.environ,
+        "PYTHON": str(python),
+        "RUNS": str(folder / "runs"),
+        "PLAYER": str(folder / "player"),
+        **settings,
+    }
+    subprocess.run([ROOT / "benchmark" / script], env=env, check=True, capture_output=True)
+    return [json.loads(line) for line in (folder / "calls").read_text().splitlines()]
+
+
+@pytest.mark.parametrize(
+    "script, settings, number, report",
+    [
+        ("apple_alpha.sh", {"SEEDS": "1 2"}, 2 * (1 + 12 + 7 + 1 + 12 + 3 + 2 + 4 * 7), "apple_report.py"),
+        ("torcs_alpha.sh", {}, 2 + 3 * (3 + 11 + 4) + 2 * 3, "torcs_report.py"),
+        ("gopher_alpha.sh", {"SEEDS": "1 2"}, 1 + 2 * (11 + 4), "gopher_report.py"),
+        ("gopher_alpha.sh", {"ALPHAS": "0.0", "TEMPERATURES": "", "TEACHER": ""}, 3, "gopher_report.py"),
+        ("gopher_ram.sh", {}, 3, "gopher_ram.py"),
+        ("fourrooms.sh", {"SEEDS": "1"}, 5, "dreamer_report.py"),
+        ("fourrooms.sh", {"SEEDS": "1", "AGENTS": "hwm dreamer_early", "STEPS": "1060000"}, 2, "dreamer_report.py"),
+        ("hwm_segment.sh", {"SEEDS": "1 2"}, 2 + 2 * 8, "hwm_report.py"),
+        ("ppo_k10.sh", {"SEEDS": "1"}, 6, "ppo_k10_report.py"),
+    ],
+)
+def test_every_line_of_a_study_is_a_run_that_its_method_understands(script, settings, number, report, tmp_path):
+    calls = study(script, tmp_path, **settings)
+    runs = [words for words in calls if words[0].startswith("cleanrl_thesis/")]
+    assert len(runs) == number and calls[-1][0] == f"benchmark/{report}"
+    folders = []
+    for method, *flags in runs:
+        args = importlib.import_module(method.removesuffix(".py").replace("/", ".")).parse_args(flags)
+        assert args.resume and args.seed >= 1
+        folders.append(args.run_dir)
+    assert len(set(folders)) == number - script.startswith("hwm")  # where one player records twice
+    early = [args for args in map(" ".join, runs) if "dreamer_early" in args]
+    assert all("--stop-at 260000 " in args and args.count("--stop-at") == 1 for args in early)
+
+
+LINES = "one --bonus 1\n\ntwo --bonus 2 --stop-at 12\n"
+
+
+def test_lines_are_runs_and_may_change(tmp_path):
+    (tmp_path / "lines").write_text(LINES.splitlines()[0])
+    command = [*COMMAND, "--lines", "lines"]
+    command[1] += " --env-id A-v0 --seed 1"
+    run(command, tmp_path)
+    (tmp_path / "lines").write_text(LINES)
+    out, _ = run(command, tmp_path)
+    assert out.splitlines()[-1].startswith("2 done, 0 running, 0 waiting, 0 failed")
+    results = {name: json.loads((tmp_path / "runs" / name / "result.json").read_text()) for name in ("one", "two")}
+    assert results["one"]["complete"] and results["two"]["global_step"] == 12 and not results["two"]["complete"]
+    assert run(command, tmp_path)[0].startswith("2 done, 0 running, 0 waiting, 0 failed")  # a stop of its own is an end
+
+
+@pytest.mark.parametrize(
+    "lines, flags, words",
+    [
+        ("", [], ["--lines lines", "holds no run"]),
+        ("a --x 1\na --x 2", [], ["--lines lines", "2 runs", "folder a"]),
+        ("../a --x 1", [], ["--lines lines", "../a"]),
+        ("a 'b", [], ["--lines lines", "cannot be read"]),
+        ("a", ["--env-ids", "A-v0"], ["--lines lines", "--env-ids"]),
+        (None, [], ["--lines lines", "cannot be read"]),
+    ],
+)
+def test_lines_that_are_no_runs_are_refused(lines, flags, words, tmp_path):
+    if lines is not None:
+        (tmp_path / "lines").write_text(lines)
+    _, err = run([*COMMAND, "--lines", "lines", *flags], tmp_path, code=2)
+    assert err.count("\n") == 1 and all(word in err for word in words), err
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_word_that_is_no_number_is_one_line(tmp_path):
+    _, err = run([*SMALL, "--workers", "x"], tmp_path, code=2)
+    assert err.count("\n") == 1 and err.startswith("error: ") and "--workers" in err
