@@ -51,16 +51,16 @@ def main(script: str, size: str, *flags: str) -> None:
         data, few = replay.sample(device), max(1, steps // 8)
 
         def model_gradient() -> None:
-            with learner.arithmetic():
+            with learner.autocast():
                 loss, _, _ = method.world_model_loss(model, data, 0)
             loss.backward()
 
         def behaviour_gradient() -> None:
-            with learner.arithmetic():
+            with learner.autocast():
                 losses, _ = method.behaviour_loss(learner.behaviour, dream, args.gae_lambda, args.ent_coef)
             sum(losses.values()).backward()
 
-        with learner.arithmetic(), torch.no_grad():
+        with learner.autocast(), torch.no_grad():
             frames = model.normalize(data.frames.flatten(0, 1))
             parts = {"sample": clock(lambda: replay.sample(device), few)}
             parts["encoder"] = clock(lambda: model.embedding(frames), few)

@@ -237,27 +237,38 @@ class Args:
     """bound on the norm of each gradient; inf for none"""
 
 
-SIZES = {  # features are as many as the baseline's
-    "xs": {"encoder": "tiles", "depth": 16, "deter_z": 128, "stoch_z": 4, "deter_w": 128}
-    | {"stoch_w": 20, "classes": 16}
-    | {"hidden_size": 128, "head_size": 128, "head_layers": 2, "head_norm": True}
-    | {"batch_size": 24, "chunk_length": 10, "rewarded_share": 0.1, "starts": 64, "gamma": 0.95, "image_scale": 0.25}
-    | {"kl_z_scale": 1.0, "kl_w_scale": 1.0, "kl_warmup": 1_000, "entropy_scale": 0.3}
-    | {"reward_scale": 10.0, "tanh_reward": False, "prefill": 1_000_000}
-    | {"model_learning_rate": 3e-3, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3}
-    | {"adam_eps": 1e-8, "ent_coef": 3e-3},
-    "thesis": {"encoder": "cnn", "depth": 48, "deter_z": 300, "stoch_z": 512, "deter_w": 300}
-    | {"stoch_w": 512, "classes": 1, "hidden_size": 600, "head_size": 400, "head_layers": 4, "head_norm": False}
-    | {"batch_size": 16, "chunk_length": 50, "rewarded_share": 0.0, "starts": 800, "gamma": 0.999, "image_scale": 1.0}
-    | {"kl_z_scale": 0.1, "kl_w_scale": 0.1, "kl_warmup": 0, "entropy_scale": 0.0}
-    | {"reward_scale": 1.0, "tanh_reward": True, "prefill": 50_000}
-    | {"model_learning_rate": 2e-4, "actor_learning_rate": 4e-5, "critic_learning_rate": 1e-4}
-    | {"adam_eps": 1e-5, "ent_coef": 1e-3},
+SIZES = {  # what a flag that is not given stands for, by --size; features are as many as the baseline's
+    "size": ("xs", "s", "m", "thesis"),
+    "prefill": (1_000_000, 1_000_000, 50_000, 50_000),
+    "batch_size": (24, 24, 16, 16),
+    "chunk_length": (10, 10, 50, 50),
+    "rewarded_share": (0.1, 0.1, 0.0, 0.0),
+    "starts": (64, 64, 800, 800),
+    "gamma": (0.95, 0.95, 0.999, 0.999),
+    "encoder": ("tiles", "tiles", "cnn", "cnn"),
+    "depth": (16, 24, 16, 48),
+    "deter_z": (128, 256, 306, 300),
+    "stoch_z": (4, 8, 306, 512),
+    "deter_w": (128, 256, 306, 300),
+    "stoch_w": (20, 40, 306, 512),
+    "classes": (16, 16, 1, 1),
+    "hidden_size": (128, 256, 200, 600),
+    "head_size": (128, 256, 200, 400),
+    "head_layers": (2, 2, 4, 4),
+    "head_norm": (True, True, False, False),
+    "image_scale": (0.25, 0.25, 1.0, 1.0),
+    "kl_z_scale": (1.0, 1.0, 0.1, 0.1),
+    "kl_w_scale": (1.0, 1.0, 0.1, 0.1),
+    "entropy_scale": (0.3, 0.3, 0.0, 0.0),
+    "kl_warmup": (1_000, 1_000, 0, 0),
+    "reward_scale": (10.0, 10.0, 1.0, 1.0),
+    "tanh_reward": (False, False, True, True),
+    "model_learning_rate": (3e-3, 3e-3, 2e-4, 2e-4),
+    "actor_learning_rate": (1e-3, 1e-3, 4e-5, 4e-5),
+    "critic_learning_rate": (1e-3, 1e-3, 1e-4, 1e-4),
+    "adam_eps": (1e-8, 1e-8, 1e-8, 1e-5),
+    "ent_coef": (3e-3, 3e-3, 1e-3, 1e-3),
 }
-SIZES["s"] = SIZES["xs"] | {"deter_z": 256, "stoch_z": 8, "deter_w": 256, "stoch_w": 40, "hidden_size": 256}
-SIZES["s"] |= {"head_size": 256, "depth": 24}
-SIZES["m"] = SIZES["thesis"] | {"depth": 16, "deter_z": 306, "stoch_z": 306, "deter_w": 306, "stoch_w": 306}
-SIZES["m"] |= {"hidden_size": 200, "head_size": 200, "adam_eps": 1e-8}
 
 
 class UsageError(Exception):
@@ -294,12 +305,11 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
-    if args.encoder is None:
-        args.encoder = SIZES[args.size]["encoder"]
+    column = SIZES["size"].index(args.size)
+    for name, values in SIZES.items():
+        setattr(args, name, values[column] if getattr(args, name) is None else getattr(args, name))
     if args.frame_side is None:
         args.frame_side = 64 if args.encoder == "cnn" else 2 * ROOM_SIZES[args.env_id]
-    for name, value in SIZES[args.size].items():
-        setattr(args, name, value if getattr(args, name) is None else getattr(args, name))
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
     counts = "num_envs eval_episodes checkpoint_interval stop_at train_frequency batch_size starts horizon"
     counts += " depth deter_z stoch_z deter_w stoch_w classes hidden_size head_size head_layers slow_interval"
@@ -1328,7 +1338,7 @@ class Learner:
             nn.utils.clip_grad_norm_(self.modules[name].parameters(), self.args.max_grad_norm)
             self.optimizers[name].step()
 
-    def arithmetic(self) -> contextlib.AbstractContextManager:
+    def autocast(self) -> contextlib.AbstractContextManager:
         """bfloat16 for matrix products with `--bf16`."""
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16)
 
@@ -1339,7 +1349,7 @@ class Learner:
 
     def learn_model(self, data: Chunks) -> tuple[NamedTuple, dict[str, torch.Tensor]]:
         """One step of the world model; returns the states (T, B, ...) that it made, and what to log."""
-        with self.arithmetic():
+        with self.autocast():
             loss, states, parts = world_model_loss(self.model, data, self.updates)
         self.descend(model=loss)
         return states, parts
@@ -1347,9 +1357,9 @@ class Learner:
     def learn_behaviour(self, begins: NamedTuple) -> dict[str, torch.Tensor]:
         """One step of actor and critic in dreams that begin at states (N, ...); returns what to log."""
         args = self.args
-        with self.arithmetic():
+        with self.autocast():
             dream = imagine(self.model, self.behaviour, begins, args.horizon, args.gamma)
-        with self.arithmetic():  # anew: older versions of torch keep weights that were cast without a gradient
+        with self.autocast():  # anew: older versions of torch keep weights that were cast without a gradient
             losses, parts = behaviour_loss(self.behaviour, dream, args.gae_lambda, args.ent_coef)
         self.descend(**losses)
         self.updates += 1
@@ -1389,7 +1399,7 @@ def compile_steps(learner: Learner, data: Chunks) -> bool:
         setattr(owner, name, torch.compile(step))
     works = True
     try:
-        with learner.arithmetic():
+        with learner.autocast():
             loss, states, _ = world_model_loss(model, data, 0)
             dream = imagine(model, behaviour, learner.draw_starts(states, data.terminals), 2, 1.0)
             sum(behaviour_loss(behaviour, dream, 1.0, 0.0)[0].values(), loss).backward()
@@ -1453,7 +1463,7 @@ class Player:
     def observe(self, frames: np.ndarray, begins: np.ndarray) -> None:
         """Take in frames (N, side, side, 3); begins (N,) says where an episode begins."""
         model, device = self.learner.model, self.learner.device
-        with self.learner.arithmetic():
+        with self.learner.autocast():
             embed = model.embedding(model.normalize(torch.from_numpy(frames).to(device)))
             first = torch.from_numpy(begins.astype(np.float32)).to(device)[:, None]
             state, *_ = model.filter(self.state, self.action, first, embed, model.noise(len(frames)))
@@ -1463,7 +1473,7 @@ class Player:
     def act(self, greedy: bool = False) -> np.ndarray:
         """An action for each game, (N,): drawn, or the most probable; where a segment begins, a skill first."""
         behaviour, features = self.learner.behaviour, self.state.features()
-        with self.learner.arithmetic():
+        with self.learner.autocast():
             skills = behaviour.high_policy(features)
             best = F.one_hot(skills.argmax(-1), behaviour.num_skills).float()
             drawn = best if greedy else one_hot_sample(skills, uniforms(len(skills), device=skills.device))
@@ -1773,7 +1783,7 @@ def dreamed_returns(learner: Learner, args: Args, seeds: list[int]) -> np.ndarra
     obs, _ = envs.reset(seed=seeds)
     player = Player(learner, len(seeds))
     player.observe(obs, np.ones(len(seeds), bool))
-    with learner.arithmetic():
+    with learner.autocast():
         dream = imagine(learner.model, learner.behaviour, player.state, MAX_STEPS, 1.0)
     rewards = dream.rewards.clamp(-0.999, 0.999).atanh() if args.tanh_reward else dream.rewards
     return (dream_weights(dream.discounts) * rewards).sum(0).cpu().numpy()
@@ -1998,8 +2008,8 @@ def main(args: Args) -> int:
         torch.set_rng_state(checkpoint["torch_rng"])
     else:
         collector.reset()
-    numbers = "bfloat16" if learner.bf16 else "float32"
-    arithmetic = f"{'compiled' if is_compiled else 'plain'}, {numbers} on {device.type}"
+    precision = "bfloat16" if learner.bf16 else "float32"
+    arithmetic = f"{'compiled' if is_compiled else 'plain'}, {precision} on {device.type}"
     if checkpoint and checkpoint["arithmetic"] != arithmetic:
         print(f"--resume: was {checkpoint['arithmetic']}, goes on as {arithmetic}: bytes will differ", file=sys.stderr)
     episodes_csv = CsvLog(run_dir / "episodes.csv", offsets["episodes"])

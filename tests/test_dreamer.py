@@ -736,7 +736,7 @@ def test_bfloat16_stays_near_float32(tmp_path):
     losses = []
     for learner.bf16 in (False, True):
         torch.manual_seed(1)
-        with learner.arithmetic():
+        with learner.autocast():
             losses.append(method.world_model_loss(learner.model, data, 1_000)[0].item())
     assert losses[1] == pytest.approx(losses[0], rel=0.02)
     wake(learner.behaviour)
