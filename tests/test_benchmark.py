@@ -15,6 +15,7 @@ sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one anothe
 from common import UsageError, run_main  # noqa: E402
 
 names = ("ppo_k10_report", "speed", "apple_report", "torcs_report")
+ppo_kle = importlib.import_module("report")
 report, speed, apple, torcs = map(importlib.import_module, names)
 
 
@@ -96,8 +97,8 @@ def test_a_wrong_value_is_one_line_and_exit_code_2(words, complaint, monkeypatch
     [
         (speed, ["ppo", "--rounds", "x"], "--rounds"),
         (speed, ["chess"], "chess"),
-        (report, ["--workers", "0"], "--workers 0: must be at least 1"),
-        (report, ["--known", "no/such/folder"], "--known no/such/folder"),
+        (ppo_kle, ["--workers", "0"], "--workers 0: must be at least 1"),
+        (ppo_kle, ["--known", "no/such/folder"], "--known no/such/folder"),
     ],
 )
 def test_what_cannot_be_read_is_one_line(module, words, complaint, monkeypatch, capsys):
