@@ -2,13 +2,12 @@
 
 import json
 import math
-import subprocess
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, needs_compiler
+from conftest import needs_compiler
 
 from cleanrl_thesis import distill_hybrid as distill
 
@@ -139,6 +138,31 @@ def test_numpy_policy_is_the_students(mode):
         assert np.allclose(np.bincount(actions, minlength=9) / 20_000, probabilities, atol=0.015)
 
 
+@pytest.mark.parametrize("mode", ["sampled", "greedy"])
+def test_demonstrations_and_the_video_are_of_the_mode_that_is_asked_for(mode, tmp_path, monkeypatch):
+    """Greedy the best action in every frame, sampled as often as the policy has it; scores are there of both modes."""
+    filmed = []
+    monkeypatch.setattr(distill, "record_video", lambda episode, *its: filmed.append(episode))
+    settings = {"eval_mode": mode, "save_demos": 2, "eval_episodes": 1, "capture_video": True}
+    student, update, _, args = make_update(**settings)
+    evaluation = distill.evaluate(student, update, {"": update.vector.clone()}, args, tmp_path)
+    distill.save_demonstrations(student, args, tmp_path)
+    demos = distill.read_demonstrations(tmp_path / "demos", "AppleGame-v0", 10**9)
+    manifest = json.loads((tmp_path / "demos" / "manifest.json").read_text())
+    assert manifest["mode"] == mode and len(demos) == 2 and len(filmed) == 1
+    assert filmed[0]["rewards"].sum() == evaluation[mode]["returns"][0]
+    for episode in (*demos, *filmed):
+        with torch.no_grad():
+            policy = torch.softmax(student(torch.from_numpy(episode["observations"][:-1])), 1).numpy()
+        taken = policy.argmax(1) == episode["actions"]
+        if mode == "greedy":
+            assert taken.all()
+        else:  # sums of independent draws, within four standard deviations
+            best = policy.max(1)
+            assert abs(taken.sum() - best.sum()) < 4 * np.sqrt((best * (1 - best)).sum())
+            assert best.mean() < 0.5
+
+
 class Quadrants(gym.Env):
     """Images with a bright square in one quarter, two frames of them; the action that names it earns 1, 20 times."""
 
@@ -259,23 +283,3 @@ def test_the_synthetic_human_is_the_same_for_the_same_seed():
     runs = [distill.play(distill.SyntheticHuman(2, seed), "AppleGame-v0", [1, 2], keep=True) for seed in (5, 5, 6)]
     same, other = (all(np.array_equal(a["actions"], b["actions"]) for a, b in zip(runs[0], run)) for run in runs[1:])
     assert same and not other
-
-
-def test_every_line_of_the_sweep_is_one_run(tmp_path):
-    """xargs joins a line that ends in a blank to the next one."""
-    python = tmp_path / "python"
-    python.write_text('#!/bin/sh\necho "$@" >> ' + str(tmp_path / "calls") + "\n")
-    python.chmod(0o755)
-    env = {
-        "PATH": "/usr/bin:/bin",
-        "PYTHON": str(python),
-        "SEEDS": "1 2",
-        "RUNS": str(tmp_path / "runs"),
-        "WORKERS": "1",
-    }
-    subprocess.run([ROOT / "benchmark" / "apple_alpha.sh"], env=env, check=True, capture_output=True)
-    calls = (tmp_path / "calls").read_text().splitlines()
-    assert sum("dqn_apple.py" in call for call in calls) == 2
-    students = [call for call in calls if "distill_hybrid.py" in call]
-    assert len(students) == len(set(students)) == 2 * (12 + 5 * 7 + 3 + 2 + 13)
-    assert all(call.count("--seed") == call.count("--run-dir") == 1 for call in students)

@@ -233,13 +233,19 @@ def test_students_learn_from_a_recording(at_once, tmp_path, monkeypatch):
 
 def test_practice_and_what_is_broken_off_is_not_kept(at_once, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    browser = Browser(make_args())
+    browser, paid = Browser(make_args()), []
+    step = browser.game.env.step
+
+    def pay(action):
+        outcome = step(action)
+        paid.append(outcome[1])
+        return outcome
+
+    monkeypatch.setattr(browser.game.env, "step", pay)
     with browser.connect() as socket:
-        assert browser.play(socket, "practice") == {
-            "kind": "over",
-            "score": pytest.approx(0, abs=60),
-            "recorded": False,
-        }
+        over = browser.play(socket, "practice")
+        assert over == {"kind": "over", "score": sum(paid), "recorded": False}
+        assert len(paid) == 1800 and over["score"] != 0
         assert browser.play(socket, "record", stop_after=100) == {"kind": "over", "score": None, "recorded": False}
         browser.until(socket, "ready")
         socket.send_json({"order": "record"})
