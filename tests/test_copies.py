@@ -5,6 +5,8 @@ from collections import defaultdict
 from itertools import combinations
 from pathlib import Path
 
+import pytest
+
 METHODS = sorted(
     path for path in (Path(__file__).parent.parent / "cleanrl_thesis").glob("*.py") if path.name != "__init__.py"
 )
@@ -32,7 +34,6 @@ DRIVING = {  # as PPO's twins are of chapter 4, these are of the driving task's 
 ATARI = {
     "Learner": "of DQN",
     "Minibatch": "stacks of frames, one step",
-    "Players": "games of ale-py",
     "ReplayBuffer": "each frame once",
     "check_video": "games of ale-py",
     "record_video": "games of ale-py",
@@ -97,7 +98,6 @@ DIFFERS: dict[tuple[str, str], str] = {
     ("mlp", HWM): "ELU, torch's own initialisation",
     ("read_demonstrations", HWM): "any environment with rooms",
     ("read_episode", HWM): "images, states and rooms",
-    ("split_episodes", HWM): "by pairs",
     **{(name, file): reason for name, reason in DREAMERS.items() for file in (DREAMER, HWM_DREAMER, HRL)},
     **{(name, file): reason for name, reason in HWM_AGENTS.items() for file in (HWM_DREAMER, HRL)},
     **{(name, HRL): "two levels" for name in ("Behaviour", "Dream", "imagine", "behaviour_loss")},
@@ -112,18 +112,29 @@ OWN = {  # each method's own by design
     *("Args", "Agent", "complete_args", "main", "evaluate", "finish_run", "plot_learning_curve", "print_table"),
     *("CHECKPOINT_FORMAT", "FINISH", "FREE_ON_RESUME"),
 }
+ALIKE = {  # but word for word equal in these
+    "main": [(HWM_DREAMER, HRL)],
+    "evaluate": [(DREAMER, HWM_DREAMER, HRL)],
+    "finish_run": [(DREAMER, HWM_DREAMER, HRL)],
+    "print_table": [(PPO, DQN), (DREAMER, HWM_DREAMER, HRL, ROOMS)],
+    "FINISH": [(DDPG, DQN), (PPO, DISTILL, GAIL), (DREAMER, HWM_DREAMER, HRL)],
+    "FREE_ON_RESUME": [(DDPG, DQN), (PPO, ROOMS, DREAMER, HWM_DREAMER, HRL)],
+}
 
 
 def definitions(source: str) -> dict[str, str]:
-    """Each top-level class, function and constant of a file, as the dump of its syntax tree."""
-    found = {}
+    """Each top-level class, function and constant of a file, and each loop or condition there, as the dump of its syntax tree."""
+    found = defaultdict(str)
     for node in ast.parse(source).body:
-        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
-            found[node.name] = ast.dump(node)
-        elif isinstance(node, ast.Assign):
-            for target in ast.walk(ast.Tuple(node.targets, ast.Store())):
+        if isinstance(node, (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            found[node.name] += ast.dump(node)
+        elif isinstance(node, (ast.Assign, ast.AugAssign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            for target in ast.walk(ast.Tuple(targets, ast.Store())):
                 if isinstance(target, ast.Name) and isinstance(target.ctx, ast.Store):
-                    found[target.id] = ast.dump(node)
+                    found[target.id] += ast.dump(node)
+        elif isinstance(node, (ast.For, ast.If, ast.With, ast.Try)):
+            found[ast.unparse(node).splitlines()[0]] += ast.dump(node)  # such as the registration of environments
     return found
 
 
@@ -157,10 +168,27 @@ def test_twins_are_equal():
     assert differing({path.name: path.read_text() for path in METHODS}) == []
 
 
+@pytest.mark.parametrize("name", ALIKE)
+def test_what_is_own_is_alike_where_it_can_be(name):
+    found = {path.name: definitions(path.read_text()) for path in METHODS}
+    for files in ALIKE[name]:
+        assert len({found[file][name] for file in files}) == 1, (name, files)
+
+
 def test_no_method_imports_another():
     for path in METHODS:
         forbidden = {"cleanrl_thesis", ".", *(other.stem for other in METHODS)}
         assert not imported_modules(path.read_text()) & forbidden, path.name
+
+
+def test_no_exemption_is_stale():
+    """Each is of a name that stands there and in another file too."""
+    found = {path.name: definitions(path.read_text()) for path in METHODS}
+    for name, file in DIFFERS:
+        assert name in found[file], (name, file)
+        assert any(name in found[other] for other in found if other != file), (name, file)
+    for name in OWN:
+        assert sum(name in names for names in found.values()) > 1, name
 
 
 def test_a_changed_twin_would_be_found():
@@ -171,4 +199,7 @@ def test_a_changed_twin_would_be_found():
         ("C", "a.py", "b.py"),
         ("D", "a.py", "b.py"),
     ]
+    loop = "E = {1}\nE |= {2}\nfor x in E:\n    print(x)\n"
+    assert differing({"a.py": loop, "b.py": loop.replace("{2}", "{3}")}) == [("E", "a.py", "b.py")]
+    assert differing({"a.py": loop, "b.py": loop.replace("(x)", "(-x)")}) == [("for x in E:", "a.py", "b.py")]
     assert imported_modules("from . import x\nimport cleanrl_thesis.y") == {".", "cleanrl_thesis"}
