@@ -13,10 +13,10 @@ after every crash: on the same machine the run ends with the same bytes.
 | steps, replay buffer | 10,000,000; 1,000,000 | section 2.4.3 |
 | learning rate of actor and critic | 1e-4, 1e-3 | OpenAI Baselines' defaults; section 2.4.3 names them the other way round |
 | both annealed to 0 | on | ours; Baselines' are constant |
-| policy that is kept | the best of evaluations every 200,000 steps, in episodes of their own | ours; Baselines' is the last |
+| policy that is kept | the one with the highest mean minus standard deviation of the returns in 200 episodes of its own, played every 200,000 steps | ours; Baselines' is the last |
 | γ, τ, batch, L2 of the critic, layer norm | 0.99, 0.01, 64, 1e-2, on | OpenAI Baselines' defaults |
-| observations | normalised by running statistics, clipped to 5 deviations of at least 0.1 | OpenAI Baselines' defaults |
-| updates | 50 after every 100 steps | OpenAI Baselines' defaults; with held actions that is 5 times as many for each action |
+| observations | normalised by running statistics, clipped to 5 standard deviations, each taken as at least 0.1 | OpenAI Baselines' defaults |
+| updates | 50 after every 100 steps | OpenAI Baselines' defaults; an action is held for 5 steps here, so that 20 actions are followed by 50 updates, there 100 |
 | noise | on the parameters, adapted to an action distance of 0.2 | OpenAI Baselines' defaults |
 | network | 64-64 with ReLU, the action enters the critic's second layer | OpenAI Baselines' defaults |
 | an action | held for 5 steps, 0.1 s; the reward is scaled by 0.1 | ours; Baselines has 1 and 1 |
@@ -217,10 +217,12 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
 def complete_args(args: Args) -> Args:
     """Fill in the values that follow from others, and check all. Raises UsageError."""
     args.stop_at = args.total_timesteps if args.stop_at is None else args.stop_at
-    counts = "num_envs frame_skip batch_size buffer_size eval_episodes checkpoint_interval stop_at hidden_size"
+    counts = (
+        "num_envs frame_skip batch_size buffer_size eval_episodes checkpoint_interval stop_at hidden_size "
+        "rollout_steps perturb_interval adapt_interval"
+    )
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
-        ("rollout_steps perturb_interval adapt_interval", lambda x: x >= 1, "must be at least 1"),
         ("learning_rate actor_learning_rate", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("reward_scale", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("critic_l2 noise_std", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
@@ -411,10 +413,8 @@ SLIP_FLOOR = 3.0  # m/s, least speed that slip is measured against: the model ha
 DRAG = 0.5 * 1.2 * 0.35 * 1.92  # N / (m/s)²
 WHEEL_RADIUS, WHEEL_INERTIA = 0.33, 2.4  # m, and kg m² of an axle's two wheels; ours
 ENGINE_INERTIA = 0.1  # kg m²; ours
-TORQUE, TORQUE_SLOPE = (
-    (100.0, 483.0),
-    (483 - 100) / 8_000,
-)  # N m at full throttle, at rest and from 8,000 rpm on; N m / rpm
+TORQUE = (100.0, 483.0)  # N m at full throttle, at rest and from 8,000 rpm on
+TORQUE_SLOPE = (483 - 100) / 8_000  # N m / rpm
 IDLE_RPM, LIMIT_RPM = 1_000.0, 9_152.0
 GEARS = 4.5 * np.array([3.0, 1.9, 1.4, 1.1, 0.9, 0.77])  # engine turns for a turn of the wheels
 GEAR_SPEEDS = np.array([50, 80, 110, 140, 170]) / 3.6  # m/s from which the next gear is taken
@@ -450,10 +450,7 @@ class Cars:
     The single and the vectorised environment are both made from this, so they agree bit for bit.
     """
 
-    changing = (
-        *("xy", "velocity", "spin", "yaw", "yaw_rate", "push", "shifting", "raced", "segment", "gear", "steps"),
-        *("along", "left", "angle"),
-    )
+    changing = "xy velocity spin yaw yaw_rate push shifting raced segment gear steps along left angle"
 
     def __init__(self, num_cars: int, track: Track, brake: bool = True):
         self.track, self.brake = track, brake
@@ -468,10 +465,10 @@ class Cars:
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """All arrays that change, by name."""
-        return {name: getattr(self, name) for name in self.changing}
+        return {name: getattr(self, name) for name in self.changing.split()}
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        vars(self).update({name: state[name] for name in self.changing})
+        vars(self).update({name: state[name] for name in self.changing.split()})
 
     def begin(self, car: int, rng: np.random.Generator) -> None:
         """Put a car at rest near the middle of the road, START from the start line."""
@@ -504,9 +501,8 @@ class Cars:
 
     def change_gear(self) -> None:
         """Choose the gear by the speed; while it changes there is no drive."""
-        up, down = (
-            np.searchsorted(speeds, self.velocity[0], "right") for speeds in (GEAR_SPEEDS, GEAR_SPEEDS - GEAR_GAP)
-        )
+        up = np.searchsorted(GEAR_SPEEDS, self.velocity[0], "right")
+        down = np.searchsorted(GEAR_SPEEDS - GEAR_GAP, self.velocity[0], "right")
         gear = np.clip(self.gear, up, down)
         self.shifting = np.where(gear != self.gear, SHIFT_TIME, np.maximum(self.shifting - 1 / FPS, 0))
         self.gear = gear
@@ -520,10 +516,8 @@ class Cars:
         dt = 1 / (FPS * SUBSTEPS)
         ahead, left = self.velocity
         left_front, left_rear = left + FRONT_AXLE * self.yaw_rate, left - REAR_AXLE * self.yaw_rate
-        rolling = np.array(
-            [ahead * cosine + left_front * sine, ahead]
-        )  # speeds in the wheels' directions, front and rear
-        lateral = np.array([left_front * cosine - ahead * sine, left_rear])
+        rolling = np.array([ahead * cosine + left_front * sine, ahead])  # m/s along the wheels, front and rear
+        lateral = np.array([left_front * cosine - ahead * sine, left_rear])  # across them
         reference = np.maximum(np.abs(rolling), SLIP_FLOOR)
 
         shift = self.push * HEIGHT
@@ -542,14 +536,10 @@ class Cars:
         most = dt * BRAKE[:, None] * brake / resistance
         self.spin = spin - np.clip(spin, -most, most)
 
-        (ahead_front, ahead_rear), (left_front, left_rear) = (
-            per_speed * (self.spin * WHEEL_RADIUS - rolling),
-            -per_speed * lateral,
-        )
-        ahead_front, left_front = (
-            ahead_front * cosine - left_front * sine,
-            ahead_front * sine + left_front * cosine,
-        )
+        along_front, ahead_rear = per_speed * (self.spin * WHEEL_RADIUS - rolling)  # N, along the wheels
+        across_front, left_rear = -per_speed * lateral
+        ahead_front = along_front * cosine - across_front * sine
+        left_front = along_front * sine + across_front * cosine
         self.push = (ahead_front + ahead_rear - DRAG * ahead * np.abs(ahead)) / MASS
         yaw_push = (FRONT_AXLE * left_front - REAR_AXLE * left_rear) / YAW_INERTIA
         pushes = np.array([self.push + left * self.yaw_rate, (left_front + left_rear) / MASS - ahead * self.yaw_rate])
@@ -842,7 +832,7 @@ class Critic(nn.Module):
 
 
 class Agent(nn.Module):
-    """Actor and critic, and mean and deviation of the observations that both are given normalised."""
+    """Actor and critic, and mean and standard deviation of the observations that both are given normalised."""
 
     def __init__(self, obs_dim: int, action_dim: int, hidden_size: int, layer_norm: bool):
         super().__init__()
@@ -1051,15 +1041,15 @@ def make_players(args: Args) -> GymPlayers | CarPlayers:
 
 
 class RunningNorm:
-    """Brings observations to mean 0 and deviation 1 by those of all that it has taken in, clipped to 5 (Baselines).
+    """Brings observations to mean 0 and standard deviation 1 by those of all that it has taken in, clipped to 5 (Baselines).
 
     Without `is_on` it changes nothing.
     """
 
-    least = 0.1  # of the deviation (Baselines)
+    least = 0.1  # of the standard deviation (Baselines)
 
     def __init__(self, scale: torch.Tensor, is_on: bool):
-        """`scale` (2, O) keeps mean and deviation; it is changed in place."""
+        """`scale` (2, O) keeps mean and standard deviation; it is changed in place."""
         self.scale, self.is_on, self.limit = scale, is_on, 5.0 if is_on else math.inf
         self.count, self.sums = 0, np.zeros(scale.shape)  # of observations and of their squares
         self.mean, self.deviation = scale.cpu().numpy()
@@ -1075,7 +1065,7 @@ class RunningNorm:
         self.set_scale(torch.from_numpy(np.stack([mean, deviation])))
 
     def set_scale(self, scale: torch.Tensor) -> None:
-        """Normalise by another mean and deviation, (2, O)."""
+        """Normalise by another mean and standard deviation, (2, O)."""
         self.scale.copy_(scale)
         self.mean, self.deviation = self.scale.cpu().numpy()
 
@@ -1089,6 +1079,17 @@ class RunningNorm:
     def load_state_dict(self, state: dict) -> None:
         self.count, self.sums = state["count"], state["sums"].numpy().copy()
         self.set_scale(state["scale"])
+
+
+def make_policy(optimizer: "FlatAdam", norm: RunningNorm, space: gym.spaces.Box):
+    """The actor without noise as a function from observations (N, O) to the environment's actions (N, A)."""
+    parameters = optimizer.actor_arrays(optimizer.actor_vector())
+    return lambda obs: scaled(numpy_actions(parameters, norm(obs.astype(np.float32))), space)
+
+
+def scaled(actions: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
+    """Actions (N, A) from [-1, 1] to the bounds of the environment's."""
+    return (space.low + (actions + 1) / 2 * (space.high - space.low)).astype(np.float32)
 
 
 class ReplayBuffer:
@@ -1212,9 +1213,9 @@ class ActionNoise:
 
 
 class Best:
-    """The policy whose return in the evaluations for `--keep-best-every` has the highest mean less its deviation.
+    """The policy whose returns in the evaluations for `--keep-best-every` have the highest mean minus standard deviation.
 
-    By the mean alone a fast one that crashes in 9 of 200 episodes was kept, and not one that never crashed.
+    By the mean alone, a fast policy that crashes in 9 of 200 episodes is better than a slower one that never crashes.
     """
 
     def __init__(self, optimizer: "FlatAdam", norm: RunningNorm):
@@ -1390,7 +1391,7 @@ class Update:
         return torch.func.functional_call(self.agent.critic, self.optimizer.networks(vector)[1], (obs, actions))
 
     def target_values(self, target: torch.Tensor, minibatch: Minibatch) -> torch.Tensor:
-        """r + γ Q'(s', π'(s')), (M,), by the target networks."""
+        """r + γ Q'(s', π'(s')), (M,), by the target networks (Lillicrap et al. 2016, Algorithm 1)."""
         next_actions = self.actions(target, minibatch.next_obs)
         return minibatch.rewards + minibatch.discounts * self.values(target, minibatch.next_obs, next_actions)
 
@@ -1405,6 +1406,10 @@ class Update:
         return critic_loss + decay + actor_loss, parts
 
     def plain_step(self, vector, target, mean, square, step, scale, rows) -> tuple[torch.Tensor, ...]:
+        """Change the parameters, those of the target networks and Adam's moments, (P,) each, and Adam's count, a scalar.
+
+        scale (2, O), rows (M, 2 O + A + 2) -> losses of critic and actor, and the mean Q, as scalars.
+        """
         minibatch = Minibatch.unpack(rows, scale, self.norm.limit)
         targets = self.target_values(target, minibatch)
         differentiate = compiled_gradient if torch.compiler.is_compiling() else plain_gradient
@@ -1657,7 +1662,7 @@ def play(policy, games: gym.vector.VectorEnv, seeds: list[int], keep: bool = Fal
 
 
 def window_scores(rewards: np.ndarray, terminated: bool) -> list[float]:
-    """Metres in each window of 5 s of an episode, 0 for the last one of an episode that a crash or standstill ended.
+    """Metres in each window of 5 s of an episode, 0 for the last one of an episode that ended early.
 
     A window that is cut short by the end of the time is left out, and there are none behind an end.
     """
@@ -1669,7 +1674,10 @@ def window_scores(rewards: np.ndarray, terminated: bool) -> list[float]:
 
 
 def driving_scores(episodes: list[dict[str, np.ndarray]], length: float) -> dict:
-    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s; crashes, other early ends, and laps of each."""
+    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s.
+
+    Also crashes, and as `standstills` all other early ends (stood still or turned round); and the laps of each episode.
+    """
     windows = [window_scores(episode["rewards"], bool(episode["terminated"])) for episode in episodes]
     means = [float(np.mean(scores)) for scores in windows if scores]
     crashes = sum((episode["rewards"] == -1).any() for episode in episodes)
@@ -1701,17 +1709,6 @@ def record_video(episode: dict[str, np.ndarray], args: Args, run_dir: Path) -> N
     for action in episode["actions"]:
         env.step(action)
     env.close()
-
-
-def make_policy(optimizer: FlatAdam, norm: RunningNorm, space: gym.spaces.Box):
-    """The actor without noise as a function from observations (N, O) to the environment's actions (N, A)."""
-    parameters = optimizer.actor_arrays(optimizer.actor_vector())
-    return lambda obs: scaled(numpy_actions(parameters, norm(obs.astype(np.float32))), space)
-
-
-def scaled(actions: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
-    """Actions (N, A) from [-1, 1] to the bounds of the environment's."""
-    return (space.low + (actions + 1) / 2 * (space.high - space.low)).astype(np.float32)
 
 
 def evaluate(policy, args: Args, run_dir: Path) -> dict:
@@ -1812,7 +1809,7 @@ def print_table(result: dict) -> None:
         numbers = "".join(f"{row[key]:>11.1f}" for key in ("mean", "std", "min", "max") if row[key] is not None)
         print(f"{name:32}{row['episodes']:>9}{numbers}")
     if driving:
-        ends = f"{driving['crashes']} crashes, {driving['standstills']} standstills"
+        ends = f"{driving['crashes']} crashes, {driving['standstills']} other early ends"
         print(f"{ends}; laps from {min(driving['laps']):.2f} to {max(driving['laps']):.2f}")
 
 
@@ -1908,13 +1905,13 @@ def main(args: Args) -> int:
     perturb_interval = max(1, args.perturb_interval // args.frame_skip)
     means = Means()
     iteration, updates, training_seconds, offsets = 0, 0, 0.0, {"episodes": 0, "updates": 0}
-    distance = math.nan
+    noise_distance = math.nan
     if checkpoint is None:
         players.start()
         for i in range(args.num_envs):
             explorer.begin(i)
     else:
-        iteration, updates, distance = checkpoint["iteration"], checkpoint["updates"], checkpoint["distance"]
+        iteration, updates, noise_distance = checkpoint["iteration"], checkpoint["updates"], checkpoint["distance"]
         training_seconds, offsets = checkpoint["training_seconds"], checkpoint["offsets"]
         optimizer.load_state_dict(checkpoint["optimizer"])
         norm.load_state_dict(checkpoint["norm"])
@@ -1962,16 +1959,17 @@ def main(args: Args) -> int:
         optimizer.anneal(1.0 - before / args.total_timesteps if args.anneal_lr else 1.0)
         for _ in range(args.train_steps if buffer.added >= args.batch_size else 0):
             if updates % args.adapt_interval == 0:
-                distance = explorer.adapt(norm(buffer.sample(args.batch_size, rng).numpy()[:, :obs_dim]))
+                noise_distance = explorer.adapt(norm(buffer.sample(args.batch_size, rng).numpy()[:, :obs_dim]))
             means.add(update(buffer.sample(args.batch_size, rng).to(device)))
             updates += 1
         if not optimizer.vector.isfinite().all():
             raise RunError(f"step {global_step}: the networks' parameters are no longer finite")
-        is_last = iteration == args.num_iterations
-        if args.keep_best_every and (is_last or global_step // args.keep_best_every > before // args.keep_best_every):
+        schedule_ends = iteration == args.num_iterations  # last_iteration may be that of an earlier --stop-at
+        every = args.keep_best_every
+        if every and (schedule_ends or global_step // every > before // every):
             best.consider(args, env.action_space, global_step)
 
-        logs = global_step // LOG_INTERVAL > before // LOG_INTERVAL or is_last
+        logs = global_step // LOG_INTERVAL > before // LOG_INTERVAL or schedule_ends
         crossed = global_step // args.checkpoint_interval > before // args.checkpoint_interval
         if not (logs or crossed or stop.received or iteration == last_iteration):
             continue
@@ -1979,7 +1977,7 @@ def main(args: Args) -> int:
         now = time.perf_counter()
         training_seconds, last_time = training_seconds + now - last_time, now
         if logs:
-            metrics = {**means.take(), "charts/noise_size": explorer.size, "charts/noise_distance": distance}
+            metrics = {**means.take(), "charts/noise_size": explorer.size, "charts/noise_distance": noise_distance}
             metrics["charts/selection_return"] = best.last_score
             updates_csv.write({"global_step": global_step, **metrics})
             add_scalars(writer, {**metrics, "charts/SPS": global_step / training_seconds}, global_step)
@@ -1989,7 +1987,7 @@ def main(args: Args) -> int:
                 "arithmetic": arithmetic,
                 "iteration": iteration,
                 "updates": updates,
-                "distance": distance,
+                "distance": noise_distance,
                 "training_seconds": training_seconds,
                 "offsets": {"episodes": episodes_csv.sync(), "updates": updates_csv.sync()},
                 "optimizer": optimizer.state_dict(),

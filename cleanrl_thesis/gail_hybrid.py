@@ -29,7 +29,7 @@ agent, and its score stands to the DDPG experts' as in Table 2.3. `--demos-human
 | actions that the discriminator sees | within the bounds | ours; the study's code shows them as sampled |
 | CG iterations, damping; γ, λ; passes over the value function, rate; entropies | 10, 0.1; 0.995, 0.97; 5, 1e-3; 0, 1e-3 | the study's code |
 | which label is the expert's | D → 0 | Eq. 2.3.1; the prose and the study's code have D and 1 − D swapped |
-| normalisation of observations | mean and deviation of the demonstrations, fixed | ours; the study's code keeps running ones |
+| normalisation of observations | mean and standard deviation of the demonstrations, fixed | ours; the study's code keeps running ones |
 | a time-out | the value goes on behind it | ours; the study's code takes it for an end |
 """
 
@@ -238,14 +238,12 @@ def complete_args(args: Args) -> Args:
     args.stop_at = max(1, args.total_timesteps) if args.stop_at is None else args.stop_at
     if args.frame_skip is None:
         args.frame_skip = 5 if is_driving(args.env_id) else 1
-    counts = "num_envs eval_episodes checkpoint_interval stop_at human_episodes hidden_size"
+    counts = (
+        "num_envs eval_episodes checkpoint_interval stop_at human_episodes hidden_size "
+        "g_steps d_steps value_epochs value_batch_size cg_iterations fisher_every frame_skip"
+    )
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
-        (
-            "g_steps d_steps value_epochs value_batch_size cg_iterations fisher_every frame_skip",
-            lambda x: x >= 1,
-            "must be at least 1",
-        ),
         ("learning_rate value_learning_rate max_kl", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("kl_slack", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("cg_damping ent_coef d_ent_coef d_grad_penalty", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
@@ -445,10 +443,8 @@ SLIP_FLOOR = 3.0  # m/s, least speed that slip is measured against: the model ha
 DRAG = 0.5 * 1.2 * 0.35 * 1.92  # N / (m/s)²
 WHEEL_RADIUS, WHEEL_INERTIA = 0.33, 2.4  # m, and kg m² of an axle's two wheels; ours
 ENGINE_INERTIA = 0.1  # kg m²; ours
-TORQUE, TORQUE_SLOPE = (
-    (100.0, 483.0),
-    (483 - 100) / 8_000,
-)  # N m at full throttle, at rest and from 8,000 rpm on; N m / rpm
+TORQUE = (100.0, 483.0)  # N m at full throttle, at rest and from 8,000 rpm on
+TORQUE_SLOPE = (483 - 100) / 8_000  # N m / rpm
 IDLE_RPM, LIMIT_RPM = 1_000.0, 9_152.0
 GEARS = 4.5 * np.array([3.0, 1.9, 1.4, 1.1, 0.9, 0.77])  # engine turns for a turn of the wheels
 GEAR_SPEEDS = np.array([50, 80, 110, 140, 170]) / 3.6  # m/s from which the next gear is taken
@@ -484,10 +480,7 @@ class Cars:
     The single and the vectorised environment are both made from this, so they agree bit for bit.
     """
 
-    changing = (
-        *("xy", "velocity", "spin", "yaw", "yaw_rate", "push", "shifting", "raced", "segment", "gear", "steps"),
-        *("along", "left", "angle"),
-    )
+    changing = "xy velocity spin yaw yaw_rate push shifting raced segment gear steps along left angle"
 
     def __init__(self, num_cars: int, track: Track, brake: bool = True):
         self.track, self.brake = track, brake
@@ -502,10 +495,10 @@ class Cars:
 
     def state_dict(self) -> dict[str, np.ndarray]:
         """All arrays that change, by name."""
-        return {name: getattr(self, name) for name in self.changing}
+        return {name: getattr(self, name) for name in self.changing.split()}
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        vars(self).update({name: state[name] for name in self.changing})
+        vars(self).update({name: state[name] for name in self.changing.split()})
 
     def begin(self, car: int, rng: np.random.Generator) -> None:
         """Put a car at rest near the middle of the road, START from the start line."""
@@ -538,9 +531,8 @@ class Cars:
 
     def change_gear(self) -> None:
         """Choose the gear by the speed; while it changes there is no drive."""
-        up, down = (
-            np.searchsorted(speeds, self.velocity[0], "right") for speeds in (GEAR_SPEEDS, GEAR_SPEEDS - GEAR_GAP)
-        )
+        up = np.searchsorted(GEAR_SPEEDS, self.velocity[0], "right")
+        down = np.searchsorted(GEAR_SPEEDS - GEAR_GAP, self.velocity[0], "right")
         gear = np.clip(self.gear, up, down)
         self.shifting = np.where(gear != self.gear, SHIFT_TIME, np.maximum(self.shifting - 1 / FPS, 0))
         self.gear = gear
@@ -554,10 +546,8 @@ class Cars:
         dt = 1 / (FPS * SUBSTEPS)
         ahead, left = self.velocity
         left_front, left_rear = left + FRONT_AXLE * self.yaw_rate, left - REAR_AXLE * self.yaw_rate
-        rolling = np.array(
-            [ahead * cosine + left_front * sine, ahead]
-        )  # speeds in the wheels' directions, front and rear
-        lateral = np.array([left_front * cosine - ahead * sine, left_rear])
+        rolling = np.array([ahead * cosine + left_front * sine, ahead])  # m/s along the wheels, front and rear
+        lateral = np.array([left_front * cosine - ahead * sine, left_rear])  # across them
         reference = np.maximum(np.abs(rolling), SLIP_FLOOR)
 
         shift = self.push * HEIGHT
@@ -576,14 +566,10 @@ class Cars:
         most = dt * BRAKE[:, None] * brake / resistance
         self.spin = spin - np.clip(spin, -most, most)
 
-        (ahead_front, ahead_rear), (left_front, left_rear) = (
-            per_speed * (self.spin * WHEEL_RADIUS - rolling),
-            -per_speed * lateral,
-        )
-        ahead_front, left_front = (
-            ahead_front * cosine - left_front * sine,
-            ahead_front * sine + left_front * cosine,
-        )
+        along_front, ahead_rear = per_speed * (self.spin * WHEEL_RADIUS - rolling)  # N, along the wheels
+        across_front, left_rear = -per_speed * lateral
+        ahead_front = along_front * cosine - across_front * sine
+        left_front = along_front * sine + across_front * cosine
         self.push = (ahead_front + ahead_rear - DRAG * ahead * np.abs(ahead)) / MASS
         yaw_push = (FRONT_AXLE * left_front - REAR_AXLE * left_rear) / YAW_INERTIA
         pushes = np.array([self.push + left * self.yaw_rate, (left_front + left_rear) / MASS - ahead * self.yaw_rate])
@@ -1767,7 +1753,7 @@ def play(policy, games: gym.vector.VectorEnv, seeds: list[int], keep: bool = Fal
 
 
 def window_scores(rewards: np.ndarray, terminated: bool) -> list[float]:
-    """Metres in each window of 5 s of an episode, 0 for the last one of an episode that a crash or standstill ended.
+    """Metres in each window of 5 s of an episode, 0 for the last one of an episode that ended early.
 
     A window that is cut short by the end of the time is left out, and there are none behind an end.
     """
@@ -1779,7 +1765,10 @@ def window_scores(rewards: np.ndarray, terminated: bool) -> list[float]:
 
 
 def driving_scores(episodes: list[dict[str, np.ndarray]], length: float) -> dict:
-    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s; crashes, other early ends, and laps of each."""
+    """Table 2.3's score of episodes on a road, from their means, in m and in (km/h) s.
+
+    Also crashes, and as `standstills` all other early ends (stood still or turned round); and the laps of each episode.
+    """
     windows = [window_scores(episode["rewards"], bool(episode["terminated"])) for episode in episodes]
     means = [float(np.mean(scores)) for scores in windows if scores]
     crashes = sum((episode["rewards"] == -1).any() for episode in episodes)

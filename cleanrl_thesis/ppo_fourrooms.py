@@ -527,8 +527,10 @@ class Agent(nn.Module):
         gain, cells, self.bf16 = math.sqrt(2), side // 2, bf16
         self.register_buffer("obs_mean", torch.zeros(side, side, 3))
         self.convolutions = nn.Sequential(
-            *(orthogonal(nn.Conv2d(3, channels, 2, 2), gain), nn.ReLU()),
-            *(orthogonal(nn.Conv2d(channels, 2 * channels, 3, 1), gain), nn.ReLU()),
+            orthogonal(nn.Conv2d(3, channels, 2, 2), gain),
+            nn.ReLU(),
+            orthogonal(nn.Conv2d(channels, 2 * channels, 3, 1), gain),
+            nn.ReLU(),
         )
         self.hidden = nn.Sequential(
             orthogonal(nn.Linear(2 * channels * (cells - 2) ** 2, hidden_size), gain), nn.ReLU()
@@ -646,7 +648,7 @@ class Collector:
 # The algorithm
 # ---------------------------------------------------------------------------------------------------------------------
 def gae(rewards: np.ndarray, values: np.ndarray, dones: np.ndarray, gamma: float, gae_lambda: float) -> np.ndarray:
-    """Generalised advantage estimation, for all games at once.
+    """Generalised advantage estimation, A(τ, V, t) of Eq. 4.2.3, for all games at once.
 
     rewards (T, N), values (T + 1, N), dones (T, N), 1 where the episode ended with step t -> advantages (T, N).
     """
@@ -694,9 +696,9 @@ def ppo_loss(
     share of clipped ratios, before the step. logits (M, A), values (M,)."""
     log_policy = logits.log_softmax(1)
     logratio = log_policy.gather(1, minibatch.actions[:, None]).squeeze(1) - minibatch.logprobs
-    ratio = logratio.exp()
+    ratio = logratio.exp()  # ρ_t(θ)
     clipped_ratio = ratio.clamp(1 - clip_coef, 1 + clip_coef)
-    pg_loss = -torch.min(minibatch.advantages * ratio, minibatch.advantages * clipped_ratio).mean()
+    pg_loss = -torch.min(minibatch.advantages * ratio, minibatch.advantages * clipped_ratio).mean()  # Eq. 4.2.6
     v_loss = 0.5 * (values - minibatch.returns).square().mean()
     entropy = -(log_policy.exp() * log_policy).sum(1).mean()
     loss = pg_loss + vf_coef * v_loss - ent_coef * entropy
@@ -738,6 +740,7 @@ class Update:
             print(f"--compile: failed ({first_line(error)}), goes on without", file=sys.stderr)
 
     def plain_loss(self, minibatch: Batch) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        """A minibatch of M steps -> `ppo_loss` of the agent: the loss and its five parts, as scalars."""
         args = self.args
         return ppo_loss(*self.agent(minibatch.obs), minibatch, args.clip_coef, args.ent_coef, args.vf_coef)
 
