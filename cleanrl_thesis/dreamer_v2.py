@@ -903,9 +903,14 @@ def world_model_loss(
     goes_on = model.discount(features).squeeze(-1).float()
     discount = F.binary_cross_entropy_with_logits(goes_on, 1 - data.terminals.flatten())
     kl = balanced(kl_categorical, made.posterior, made.prior, args.kl_balance)
-    loss = args.image_scale * image + args.reward_scale * reward + args.discount_scale * discount
     share = warm_up(args, updates)
-    loss = loss + share * args.kl_scale * kl.mean() - (1 - share) * args.entropy_scale * entropy(made.posterior).mean()
+    loss = (
+        args.image_scale * image
+        + args.reward_scale * reward
+        + args.discount_scale * discount
+        + share * args.kl_scale * kl.mean()
+        - (1 - share) * args.entropy_scale * entropy(made.posterior).mean()
+    )
     inside = 1 - data.first  # a first frame costs tens of nats, which say nothing of the dynamics
     parts = {
         "image": image,
@@ -1155,6 +1160,13 @@ def episode_seed(seed: int, stream: int, episode: int) -> int:
     return episode_seeds(seed, stream, episode // 256)[episode % 256]
 
 
+def pick(logits: torch.Tensor, greedy: bool) -> torch.Tensor:
+    """The most probable choice of each row of logits (N, C), or one that is drawn; one-hot, (N, C)."""
+    if greedy:
+        return F.one_hot(logits.argmax(-1), logits.shape[-1]).float()
+    return one_hot_sample(logits, uniforms(len(logits), device=logits.device))
+
+
 class Player:
     """Acts in N games side by side: the state that it believes each game to be in, and its last action."""
 
@@ -1178,8 +1190,7 @@ class Player:
         """An action for each game, (N,): drawn, or the most probable."""
         with self.learner.autocast():
             logits = self.learner.behaviour.policy(self.state.features())
-        best = F.one_hot(logits.argmax(-1), logits.shape[-1]).float()
-        self.action = best if greedy else one_hot_sample(logits, uniforms(len(logits), device=logits.device))
+        self.action = pick(logits, greedy)
         return self.action.argmax(-1).cpu().numpy()
 
     def act_randomly(self) -> np.ndarray:

@@ -1100,20 +1100,24 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     decides = 1 - made.forced[1:]  # q(m_t) pairs with p(m_t) where step t + 1 was free to read or to copy
     kl_m = decides * balanced(kl_bernoulli, made.q_m[:-1], made.p_m, args.kl_balance)
     settled = decides * (1 - data.first[:-1])  # a read after the first ends no segment: at the first c knows nothing
-    expected = (torch.sigmoid(made.q_m[:-1]) * settled).sum() / settled.sum().clamp(min=1)
+    read_rate = (torch.sigmoid(made.q_m[:-1]) * settled).sum() / settled.sum().clamp(min=1)  # by q(m)
     features = as_computed(flat.features())
     target = data.rewards.tanh() if args.tanh_reward else data.rewards
     reward = 0.5 * (model.reward(features).squeeze(-1).float() - target.flatten()).square().mean()
     goes_on = model.discount(features).squeeze(-1).float()
     discount = F.binary_cross_entropy_with_logits(goes_on, 1 - data.terminals.flatten())
-    loss = args.image_scale * image + args.reward_scale * reward + args.discount_scale * discount
-    kl_of_states = args.kl_z_scale * kl_z.mean() + args.kl_w_scale * kl_w.mean()
-    share = warm_up(args, updates)
-    loss = loss + share * kl_of_states + args.kl_m_scale * kl_m.mean()
+    share, code_entropy = warm_up(args, updates), 0.0
     if args.classes > 1:
-        broad = (made.reads.detach() * entropy(made.q_z.logits)).mean() + entropy(made.q_w.logits).mean()
-        loss = loss - (1 - share) * args.entropy_scale * broad
-    loss = loss + args.budget_price * F.relu(expected - budget)
+        code_entropy = (made.reads.detach() * entropy(made.q_z.logits)).mean() + entropy(made.q_w.logits).mean()
+    loss = (
+        args.image_scale * image
+        + args.reward_scale * reward
+        + args.discount_scale * discount
+        + share * (args.kl_z_scale * kl_z.mean() + args.kl_w_scale * kl_w.mean())
+        + args.kl_m_scale * kl_m.mean()
+        - (1 - share) * args.entropy_scale * code_entropy
+        + args.budget_price * F.relu(read_rate - budget)
+    )
     inside = 1 - data.first  # a first frame costs tens of nats, which say nothing of the dynamics
     read = made.reads.detach() * inside
     parts = {"image": image, "reward": reward, "discount": discount, "kl_m": kl_m.mean()}
@@ -1122,7 +1126,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     follows = inside[1:] * (1 - data.first[:-1])
     later = (read[1:] * follows).sum()
     parts |= {"read_rate": later / follows.sum().clamp(min=1), "segment_length": follows.sum() / later.clamp(min=1)}
-    spread = ((torch.sigmoid(made.q_m[:-1]) - expected).square() * settled).sum() / settled.sum().clamp(min=1)
+    spread = ((torch.sigmoid(made.q_m[:-1]) - read_rate).square() * settled).sum() / settled.sum().clamp(min=1)
     parts |= {"read_spread": spread.sqrt()}  # 0: q(m) is the same everywhere
     return loss, made.belief, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
@@ -1366,6 +1370,13 @@ def episode_seed(seed: int, stream: int, episode: int) -> int:
     return episode_seeds(seed, stream, episode // 256)[episode % 256]
 
 
+def pick(logits: torch.Tensor, greedy: bool) -> torch.Tensor:
+    """The most probable choice of each row of logits (N, C), or one that is drawn; one-hot, (N, C)."""
+    if greedy:
+        return F.one_hot(logits.argmax(-1), logits.shape[-1]).float()
+    return one_hot_sample(logits, uniforms(len(logits), device=logits.device))
+
+
 class Player:
     """Acts in N games side by side: the state that it believes each game to be in, and its last action."""
 
@@ -1389,8 +1400,7 @@ class Player:
         """An action for each game, (N,): drawn, or the most probable."""
         with self.learner.autocast():
             logits = self.learner.behaviour.policy(self.state.features())
-        best = F.one_hot(logits.argmax(-1), logits.shape[-1]).float()
-        self.action = best if greedy else one_hot_sample(logits, uniforms(len(logits), device=logits.device))
+        self.action = pick(logits, greedy)
         return self.action.argmax(-1).cpu().numpy()
 
     def act_randomly(self) -> np.ndarray:

@@ -1101,20 +1101,24 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     decides = 1 - made.forced[1:]  # q(m_t) pairs with p(m_t) where step t + 1 was free to read or to copy
     kl_m = decides * balanced(kl_bernoulli, made.q_m[:-1], made.p_m, args.kl_balance)
     settled = decides * (1 - data.first[:-1])  # a read after the first ends no segment: at the first c knows nothing
-    expected = (torch.sigmoid(made.q_m[:-1]) * settled).sum() / settled.sum().clamp(min=1)
+    read_rate = (torch.sigmoid(made.q_m[:-1]) * settled).sum() / settled.sum().clamp(min=1)  # by q(m)
     features = as_computed(flat.features())
     target = data.rewards.tanh() if args.tanh_reward else data.rewards
     reward = 0.5 * (model.reward(features).squeeze(-1).float() - target.flatten()).square().mean()
     goes_on = model.discount(features).squeeze(-1).float()
     discount = F.binary_cross_entropy_with_logits(goes_on, 1 - data.terminals.flatten())
-    loss = args.image_scale * image + args.reward_scale * reward + args.discount_scale * discount
-    kl_of_states = args.kl_z_scale * kl_z.mean() + args.kl_w_scale * kl_w.mean()
-    share = warm_up(args, updates)
-    loss = loss + share * kl_of_states + args.kl_m_scale * kl_m.mean()
+    share, code_entropy = warm_up(args, updates), 0.0
     if args.classes > 1:
-        broad = (made.reads.detach() * entropy(made.q_z.logits)).mean() + entropy(made.q_w.logits).mean()
-        loss = loss - (1 - share) * args.entropy_scale * broad
-    loss = loss + args.budget_price * F.relu(expected - budget)
+        code_entropy = (made.reads.detach() * entropy(made.q_z.logits)).mean() + entropy(made.q_w.logits).mean()
+    loss = (
+        args.image_scale * image
+        + args.reward_scale * reward
+        + args.discount_scale * discount
+        + share * (args.kl_z_scale * kl_z.mean() + args.kl_w_scale * kl_w.mean())
+        + args.kl_m_scale * kl_m.mean()
+        - (1 - share) * args.entropy_scale * code_entropy
+        + args.budget_price * F.relu(read_rate - budget)
+    )
     inside = 1 - data.first  # a first frame costs tens of nats, which say nothing of the dynamics
     read = made.reads.detach() * inside
     parts = {"image": image, "reward": reward, "discount": discount, "kl_m": kl_m.mean()}
@@ -1123,7 +1127,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     follows = inside[1:] * (1 - data.first[:-1])
     later = (read[1:] * follows).sum()
     parts |= {"read_rate": later / follows.sum().clamp(min=1), "segment_length": follows.sum() / later.clamp(min=1)}
-    spread = ((torch.sigmoid(made.q_m[:-1]) - expected).square() * settled).sum() / settled.sum().clamp(min=1)
+    spread = ((torch.sigmoid(made.q_m[:-1]) - read_rate).square() * settled).sum() / settled.sum().clamp(min=1)
     parts |= {"read_spread": spread.sqrt()}  # 0: q(m) is the same everywhere
     return loss, made.belief, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
@@ -1230,10 +1234,11 @@ def dream_weights(discounts: torch.Tensor) -> torch.Tensor:
 
 
 def high_return(rewards, discounts, decides, high_values, last_value, gae_lambda: float) -> torch.Tensor:
-    """G_h = r_{h+1} + d_{h+1} (m_h ? (1 − λ) V^H_{h+1} + λ G_{h+1} : G_{h+1}): the λ-return over segments, on the steps' clock.
+    """V_λ^{H,τ} of Eq. 3.3.16, the λ-return over segments, on the steps' clock: G_h = r_{h+1} + d_{h+1} X_{h+1}.
 
-    rewards and discounts (H, N), decides and high_values (H + 1, N), where decides_{h+1} is m_h -> (H, N). The dream ends with
-    V^H where a segment begins there, else with last_value (N,), V^L of the segment that goes on.
+    X_{h+1} is (1 − λ) V^H_{h+1} + λ G_{h+1} where a segment begins (m_h = 1), and G_{h+1} within one. The dream ends with V^H where
+    a segment begins there, else with last_value (N,), V^L of the segment that goes on. rewards and discounts (H, N), decides and
+    high_values (H + 1, N), where decides_{h+1} is m_h -> (H, N).
     """
     returns, following = [], torch.where(decides[-1] > 0, high_values[-1], last_value)
     for h in reversed(range(len(rewards))):
@@ -1244,7 +1249,10 @@ def high_return(rewards, discounts, decides, high_values, last_value, gae_lambda
 
 
 def policy_loss(logits, chosen, advantages, weights, ent_coef: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Eq. 3.3.9: a policy's loss, its terms weighed and summed, and its entropies (...); logits and chosen (..., A), others (...)."""
+    """A policy's loss of either level (Eq. 3.3.15, 3.3.17), its terms weighed and summed, and its entropies (...).
+
+    logits and chosen (..., A), advantages and weights (...).
+    """
     log_policy = logits.log_softmax(-1)
     entropy = -(log_policy.exp() * log_policy).sum(-1)
     terms = (log_policy * chosen).sum(-1) * advantages + ent_coef * entropy
@@ -1265,21 +1273,21 @@ def behaviour_loss(
         returns = lambda_return(dream.rewards, dream.discounts, values, gae_lambda)
         high_returns = high_return(dream.rewards, dream.discounts, dream.decides, high_values, values[-1], gae_lambda)
         weights, decides = dream_weights(dream.discounts), dream.decides[:-1] > 0
-        number = decides.sum().clamp(min=1)
+        num_decisions = decides.sum().clamp(min=1)
     logits = behaviour.policy(features, skills)
     actor, entropy = policy_loss(logits, dream.actions, returns - values[:-1], weights, ent_coef)  # Eq. 3.3.15
     critic = (weights * 0.5 * (behaviour.value(features, skills) - returns).square()).mean()  # Eq. 3.3.14
-    at, advantages = features[decides], (high_returns - high_values[:-1])[decides]  # (M, F), (M,)
-    chosen, high_weights = skills[decides], weights[decides]
-    high_actor, high_entropy = policy_loss(behaviour.high_policy(at), chosen, advantages, high_weights, ent_coef)
-    errors = 0.5 * (behaviour.high_value(at) - high_returns[decides]).square()
-    high_critic = (high_weights * errors).sum() / number  # Eq. 3.3.16
+    high_features, advantages = features[decides], (high_returns - high_values[:-1])[decides]  # (M, F), (M,)
+    chosen, high_weights, high_logits = skills[decides], weights[decides], behaviour.high_policy(high_features)
+    high_actor, high_entropy = policy_loss(high_logits, chosen, advantages, high_weights, ent_coef)  # Eq. 3.3.17
+    errors = 0.5 * (behaviour.high_value(high_features) - high_returns[decides]).square()
+    high_critic = (high_weights * errors).sum() / num_decisions  # Eq. 3.3.16
     losses = {"actor": actor / weights.numel(), "critic": critic}
-    losses |= {"high_actor": high_actor / number, "high_critic": high_critic}  # Eq. 3.3.17
+    losses |= {"high_actor": high_actor / num_decisions, "high_critic": high_critic}
     parts = {
         **losses,
         "entropy": entropy.mean(),
-        "high_entropy": high_entropy.sum() / number,
+        "high_entropy": high_entropy.sum() / num_decisions,
         "advantage_std": (returns - values[:-1]).std(correction=0),
     }
     parts |= {
@@ -1450,6 +1458,13 @@ def episode_seed(seed: int, stream: int, episode: int) -> int:
     return episode_seeds(seed, stream, episode // 256)[episode % 256]
 
 
+def pick(logits: torch.Tensor, greedy: bool) -> torch.Tensor:
+    """The most probable choice of each row of logits (N, C), or one that is drawn; one-hot, (N, C)."""
+    if greedy:
+        return F.one_hot(logits.argmax(-1), logits.shape[-1]).float()
+    return one_hot_sample(logits, uniforms(len(logits), device=logits.device))
+
+
 class Player:
     """Acts in N games side by side: the state that it believes each game to be in, and its last action."""
 
@@ -1474,13 +1489,9 @@ class Player:
         """An action for each game, (N,): drawn, or the most probable; where a segment begins, a skill first."""
         behaviour, features = self.learner.behaviour, self.state.features()
         with self.learner.autocast():
-            skills = behaviour.high_policy(features)
-            best = F.one_hot(skills.argmax(-1), behaviour.num_skills).float()
-            drawn = best if greedy else one_hot_sample(skills, uniforms(len(skills), device=skills.device))
-            self.skill = torch.where(self.state.age == 0, drawn, self.skill)
+            self.skill = torch.where(self.state.age == 0, pick(behaviour.high_policy(features), greedy), self.skill)
             logits = behaviour.policy(features, self.skill)
-        best = F.one_hot(logits.argmax(-1), logits.shape[-1]).float()
-        self.action = best if greedy else one_hot_sample(logits, uniforms(len(logits), device=logits.device))
+        self.action = pick(logits, greedy)
         return self.action.argmax(-1).cpu().numpy()
 
     def act_randomly(self) -> np.ndarray:

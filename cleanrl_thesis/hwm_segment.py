@@ -629,16 +629,16 @@ class HWM(nn.Module):
             state, updated, q_z, q_w = self.step(
                 state, previous_action, read, begins, embed[t], draws, mode in ("prior", "sampled")
             )
-            made.append((*state, updated, *q_z, *q_w, read, force))
+            made.append((state, q_z, q_w, updated, read, force))
             previous_action, previous_m = taken[t], m[t, :, None]
             if mode in ("prior", "sampled"):
                 p = torch.sigmoid(self.prior_m(torch.cat([*state, taken[t]], -1)))
                 previous_m = (p > (uniforms(*p.shape, device=p.device) if mode == "sampled" else 0.5)).float()
-        columns = [torch.stack(column) for column in zip(*made)]  # (T, B, ...)
-        belief = Belief(*columns[:4])
+        *states, updates, reads, forced = zip(*made)
+        belief, q_z, q_w = (type(column[0])(*(torch.stack(part) for part in zip(*column))) for column in states)
+        updated, reads, forced = (torch.stack(column) for column in (updates, reads, forced))  # (T, B, ...)
         p_m = self.prior_m(torch.cat([*belief, taken], -1)).squeeze(-1)
-        reads, forced = columns[9].squeeze(-1), columns[10].squeeze(-1)
-        return Inference(belief, reads, forced, columns[4], Normal(*columns[5:7]), Normal(*columns[7:9]), q_m, p_m)
+        return Inference(belief, reads.squeeze(-1), forced.squeeze(-1), updated, q_z, q_w, q_m, p_m)
 
     def decode(self, belief: Belief, use_z: float = 1.0, use_w: float = 1.0) -> torch.Tensor:
         """Mean of p(o_t | w_t, z_t), (..., F); 0 turns z or w off (rows b to d of Fig. 3.4)."""
