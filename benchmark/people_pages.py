@@ -106,7 +106,8 @@ def main() -> int:
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
     ).stdout.strip()
-    (OUT / "latency.json").write_text(json.dumps({"commit": commit, **times}, indent=2) + "\n")
+    about = {"command": "python benchmark/people_pages.py", "commit": commit}
+    (OUT / "latency.json").write_text(json.dumps({**about, **times}, indent=2) + "\n")
     print(json.dumps(times, indent=2))
     return 0
 
