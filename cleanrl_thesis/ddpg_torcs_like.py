@@ -122,40 +122,42 @@ class Args:
 
     # Algorithm
     env_id: str = "TorcsLike-v0"
-    """the environment: TorcsLike-v0 or a Gymnasium id with flat Box observations and bounded Box actions"""
+    """the environment: TorcsLike-v0 or a Gymnasium id with flat Box observations and bounded Box actions (ours; section 2.4.3
+    has TORCS)"""
     track_name: str = "meadow"
-    """the road of TorcsLike-v0: meadow, speedway, hills or city"""
+    """the road of TorcsLike-v0: meadow, speedway, hills or city (ours, after roads of TORCS)"""
     reward: Literal["distance", "speed"] = "distance"
-    """TorcsLike-v0: metres of progress (section 2.4.3), or the speed along the road in km/h; -1 for a crash; evaluations, the
-    policy that is kept and demonstrations count metres in any case"""
+    """TorcsLike-v0: metres of progress, or the speed along the road in km/h; -1 for a crash; evaluations, the policy that is
+    kept and demonstrations count metres in any case (section 2.4.3; speed: the study's code)"""
     brake: bool = True
-    """TorcsLike-v0: negative throttle brakes; off: it coasts, as in gym_torcs"""
+    """TorcsLike-v0: negative throttle brakes; off: it coasts, as in gym_torcs (ours)"""
     total_timesteps: int = 10_000_000
     """environment steps (section 2.4.3)"""
     num_envs: int = 10
-    """environments side by side"""
+    """environments side by side (ours; Baselines has one)"""
     frame_skip: int = 5
-    """steps for which an action is held; all other numbers of steps count each of them"""
+    """steps for which an action is held; all other numbers of steps count each of them (ours; Baselines has 1)"""
     actor_learning_rate: float = 1e-4
     """Adam's learning rate for the actor (Baselines)"""
     learning_rate: float = 1e-3
     """Adam's learning rate for the critic (Baselines)"""
     anneal_lr: bool = True
-    """anneal both learning rates linearly to 0; off: constant (Baselines)"""
+    """anneal both learning rates linearly to 0 (ours); off: constant (Baselines)"""
     keep_best_every: int = 200_000
-    """steps between evaluations without noise, and one at the end, whose best policy is kept; 0: the last (Baselines)"""
+    """steps between evaluations of 200 episodes without noise, and one at the end: the policy is kept whose returns have the
+    highest mean minus standard deviation (ours); 0: the last (Baselines)"""
     critic_l2: float = 1e-2
-    """weight of half the squared weights of the critic's two hidden layers in its loss (Baselines has three)"""
+    """weight of half the squared weights of the critic's two hidden layers in its loss (Baselines, there of three layers)"""
     hidden_size: int = 64
     """units in each of the two hidden layers (Baselines)"""
     layer_norm: bool = True
     """normalise the hidden layers (Baselines)"""
     normalize_obs: bool = True
-    """bring observations to mean 0 and deviation 1 by running statistics, clipped to 5 deviations (Baselines)"""
+    """bring observations to mean 0 and standard deviation 1 by running statistics, clipped to 5 deviations (Baselines)"""
     buffer_size: int = 1_000_000
-    """transitions in the replay buffer (section 2.4.3); 536 bytes each with TorcsLike-v0"""
+    """transitions in the replay buffer, 536 bytes each with TorcsLike-v0 (section 2.4.3)"""
     gamma: float = 0.99
-    """discount factor γ (Baselines)"""
+    """discount factor γ of one action, which is `--frame-skip` steps (Baselines)"""
     tau: float = 0.01
     """share of the networks that goes into the target networks with each update (Baselines)"""
     batch_size: int = 64
@@ -165,15 +167,15 @@ class Args:
     train_steps: int = 50
     """updates after them (Baselines)"""
     reward_scale: float = 0.1
-    """factor of the reward in training"""
+    """factor of the reward in training (ours; Baselines has 1)"""
     noise: Literal["parameter", "ou", "gaussian", "none"] = "parameter"
-    """noise on the actor's parameters, or on its actions: Ornstein-Uhlenbeck or Gaussian"""
+    """noise on the actor's parameters, or on its actions: Ornstein-Uhlenbeck or Gaussian (Baselines)"""
     noise_std: float = 0.2
-    """standard deviation of the noise on actions; for noise on the parameters the distance of actions aimed at"""
+    """standard deviation of the noise on actions; for noise on the parameters the distance of actions aimed at (Baselines)"""
     noise_ladder: bool = True
-    """the first environment has all of the noise, the last none, those between shares of it; off: each has all"""
+    """the first environment has all of the noise, the last none, those between shares of it; off: each has all (ours)"""
     perturb_interval: int = 500
-    """steps of an environment after which its perturbed actor is drawn anew, as at the start of each episode"""
+    """steps of an environment after which its perturbed actor is drawn anew, as at the start of each episode (ours)"""
     adapt_interval: int = 50
     """updates between changes of the size of the noise on the parameters (Baselines)"""
 

@@ -127,16 +127,17 @@ class Args:
 
     # Algorithm
     env_id: str = "TorcsLike-v0"
-    """the environment: TorcsLike-v0 or a Gymnasium id with flat Box observations and bounded Box actions"""
+    """the environment: TorcsLike-v0 or a Gymnasium id with flat Box observations and bounded Box actions (ours; section 2.4.3
+    has TORCS)"""
     track_name: str = "meadow"
-    """the road of TorcsLike-v0: meadow, speedway, hills or city"""
+    """the road of TorcsLike-v0: meadow, speedway, hills or city (ours, after roads of TORCS)"""
     brake: bool = True
-    """TorcsLike-v0: negative throttle brakes; off: it coasts, as in gym_torcs"""
+    """TorcsLike-v0: negative throttle brakes; off: it coasts, as in gym_torcs (ours)"""
     demos_rl: Path | None = None
-    """folder of the RL expert's demonstrations; needed for α > 0, and not read for α = 0"""
+    """folder of the RL expert's demonstrations; needed for α > 0, and not read for α = 0 (section 2.4.3)"""
     demos_human: Path | None = None
-    """folder of recorded demonstrations; default: the synthetic human's are made and put into `demos_synthetic_human/`; not
-    read for α = 1"""
+    """folder of recorded demonstrations (section 2.4.3); default: the synthetic human's are made and put into
+    `demos_synthetic_human/` (ours); not read for α = 1"""
     human_episodes: int = 220
     """episodes of 60 s of the synthetic human (section 2.4.3)"""
     alpha: float = 0.5
@@ -144,53 +145,55 @@ class Args:
     total_timesteps: int | None = None
     """environment steps; default: 5,000,000 for α = 0, else 7,500,000 (section 2.4.3)"""
     num_envs: int = 16
-    """environments side by side"""
+    """environments side by side (ours; the study's code has one)"""
     num_steps: int = 64
-    """actions of each environment per update"""
+    """actions of each environment per update (ours; the study's code has 1,024 for GAIL, 512 for the hybrid)"""
     frame_skip: int | None = None
-    """steps for which an action is held, of which demonstrations give the first; default: 5 for TorcsLike-v0, else 1"""
+    """steps for which an action is held, of which demonstrations give the first; default: 5 for TorcsLike-v0, else 1 (ours; the
+    study's code acts in each step)"""
     g_steps: int = 3
-    """updates of the policy for each round of the discriminator"""
+    """updates of the policy for each round of the discriminator (the study's code)"""
     d_steps: int = 1
-    """steps of Adam in such a round"""
+    """steps of Adam in such a round (the study's code)"""
     learning_rate: float = 1e-3
     """Adam's learning rate for the discriminator (section 2.4.3)"""
     value_learning_rate: float = 1e-3
-    """Adam's learning rate for the value function"""
+    """Adam's learning rate for the value function (the study's code)"""
     value_epochs: int = 5
-    """passes over each batch for the value function"""
+    """passes over each batch for the value function (the study's code)"""
     value_batch_size: int = 128
     """steps per update of the value function (Baselines)"""
     max_kl: float = 0.01
     """bound on the mean KL divergence of an update (section 2.4.3)"""
     anneal_kl: bool = True
-    """anneal the bound linearly to a hundredth; off: constant (the study's code)"""
+    """anneal the bound linearly to a hundredth (ours); off: constant (the study's code)"""
     kl_slack: float = 1.5
     """the line search takes a step whose KL divergence is up to this many bounds (Baselines)"""
     cg_iterations: int = 10
-    """iterations of the conjugate gradient method"""
+    """iterations of the conjugate gradient method (the study's code)"""
     cg_damping: float = 0.1
-    """multiple of the identity that is added to the Fisher matrix"""
+    """multiple of the identity that is added to the Fisher matrix (the study's code)"""
     fisher_every: int = 5
-    """the Fisher matrix is estimated from one in so many steps of a batch, drawn at random (Baselines takes every fifth)"""
+    """the Fisher matrix is estimated from one in so many steps of a batch, drawn at random (Baselines, which takes every fifth)"""
     gamma: float = 0.995
-    """discount factor γ"""
+    """discount factor γ of one action, which is `--frame-skip` steps (the study's code)"""
     gae_lambda: float = 0.97
-    """λ of generalised advantage estimation"""
+    """λ of generalised advantage estimation (the study's code)"""
     ent_coef: float = 0.0
-    """weight of the policy's entropy"""
+    """weight of the policy's entropy (the study's code)"""
     d_ent_coef: float = 1e-3
-    """weight of the discriminator's entropy"""
+    """weight of the discriminator's entropy (the study's code)"""
     d_grad_penalty: float = 10.0
-    """weight of the penalty on the discriminator's gradient between student and experts; 0: Eq. 2.3.1 as it stands"""
+    """weight of the penalty on the discriminator's gradient between student and experts; 0: Eq. 2.3.1 as it stands (ours; the
+    number is that of Gulrajani et al. 2017)"""
     reward_form: Literal["positive", "signed"] = "positive"
-    """positive: −log D (Eq. 2.3.1), with which it pays to survive; signed: log(1 − D) − log D, with which it need not"""
+    """positive: −log D, with which it pays to survive (Eq. 2.3.1); signed: log(1 − D) − log D, with which it need not (ours)"""
     bc_epochs: int = 20
     """passes over the human's demonstrations (at α = 1 the RL expert's) in which the policy first learns actions (behaviour
     cloning); 0: none; with `--total-timesteps 0` that is all: between α = 0 and 1 both experts' actions are mixed into one mean, as
-    section 2.3.2 warns against"""
+    section 2.3.2 warns against (an option of the study's code)"""
     hidden_size: int = 100
-    """units in each of the two hidden layers of all networks"""
+    """units in each of the two hidden layers of all networks (the study's code)"""
 
     # to be filled in runtime
     batch_size: tyro.conf.Suppress[int] = 0
@@ -1211,12 +1214,13 @@ class Agent(nn.Module):
         self.register_buffer("obs_mean", torch.zeros(obs_dim))
         self.register_buffer("obs_std", torch.ones(obs_dim))
 
-    def set_normalisation(self, obs: torch.Tensor) -> None:
-        """Take mean and deviation from observations (S, O)."""
+    def set_normalization(self, obs: torch.Tensor) -> None:
+        """Take mean and standard deviation from observations (S, O)."""
         self.obs_mean.copy_(obs.mean(0))
         self.obs_std.copy_(obs.std(0).clamp(min=1e-3))
 
-    def normalise(self, obs: torch.Tensor) -> torch.Tensor:
+    def normalize(self, obs: torch.Tensor) -> torch.Tensor:
+        """Observations (..., O) as the environment gives them -> as all networks see them, within ±10 standard deviations."""
         return ((obs - self.obs_mean) / self.obs_std).clamp(-10, 10)
 
     def value(self, obs: torch.Tensor) -> torch.Tensor:
@@ -1225,7 +1229,7 @@ class Agent(nn.Module):
 
     def pairs(self, obs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Observations (B, O) as the environment gives them, actions (B, A) -> the discriminator's inputs, (B, O + A)."""
-        return torch.cat([self.normalise(obs), actions], 1)
+        return torch.cat([self.normalize(obs), actions], 1)
 
     def logits(self, pairs: torch.Tensor) -> torch.Tensor:
         """Inputs (B, O + A) -> logit of D, (B,): large for the student, small for experts."""
@@ -1340,7 +1344,10 @@ def imitation_reward(logits: torch.Tensor, form: str) -> torch.Tensor:
 
 
 def gae(rewards, values, next_values, terminated, ended, gamma: float, gae_lambda: float) -> np.ndarray:
-    """Generalised advantage estimation; all arrays (T, N). Values of the real next observations: behind a time-out too."""
+    """Generalised advantage estimation, A(τ, V, t) of Eq. 4.2.3 (Schulman et al. 2016, Eq. 16); all arrays (T, N).
+
+    The values are those of the real next observations: behind a time-out too.
+    """
     advantages, advantage = np.empty_like(rewards), np.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
         delta = rewards[t] + gamma * next_values[t] * ~terminated[t] - values[t]
@@ -1365,7 +1372,9 @@ def flat_tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
 
 
 @torch.no_grad()
-def pay(agent: Agent, rollout: Rollout, space: gym.spaces.Box, form: str, device: torch.device) -> np.ndarray:
+def imitation_rewards(
+    agent: Agent, rollout: Rollout, space: gym.spaces.Box, form: str, device: torch.device
+) -> np.ndarray:
     """The student's rewards by the discriminator, (T, N)."""
     seen = bounded(rollout.actions, space.low, space.high)
     logits = agent.logits(agent.pairs(flat_tensor(rollout.obs, device), flat_tensor(seen, device)))
@@ -1375,7 +1384,7 @@ def pay(agent: Agent, rollout: Rollout, space: gym.spaces.Box, form: str, device
 @torch.no_grad()
 def make_batch(agent: Agent, rollout: Rollout, rewards: np.ndarray, space: gym.spaces.Box, args: Args, device) -> Batch:
     """Estimate values and advantages for rewards (T, N)."""
-    obs, next_obs = (agent.normalise(flat_tensor(array, device)) for array in (rollout.obs, rollout.next_obs))
+    obs, next_obs = (agent.normalize(flat_tensor(array, device)) for array in (rollout.obs, rollout.next_obs))
     values, next_values = (agent.value(x).cpu().numpy().reshape(rewards.shape) for x in (obs, next_obs))
     advantages = gae(rewards, values, next_values, rollout.terminated, rollout.ended, args.gamma, args.gae_lambda)
     returns = flat_tensor(advantages + values, device)
@@ -1444,9 +1453,9 @@ def fisher_product(policy: PolicyVector, vector: torch.Tensor, obs: torch.Tensor
 
 
 def surrogate(policy: PolicyVector, vector: torch.Tensor, batch: Batch, old_logprobs, ent_coef: float) -> torch.Tensor:
-    """Mean of ratio · advantage, and the entropy: what TRPO makes large."""
+    """Mean of ratio · advantage (Eq. 4.2.4), and the entropy: what TRPO makes large; a scalar, for old_logprobs (B,)."""
     mean, logstd = policy(vector, batch.obs)
-    ratio = (gaussian_log_prob(mean, logstd, batch.actions) - old_logprobs).exp()
+    ratio = (gaussian_log_prob(mean, logstd, batch.actions) - old_logprobs).exp()  # ρ_t(θ)
     return (ratio * batch.advantages).mean() + ent_coef * gaussian_entropy(logstd)
 
 
@@ -1458,7 +1467,10 @@ def kl_bound(iteration: int, args: Args) -> float:
 
 @torch.no_grad()
 def trpo_step(policy: PolicyVector, batch: Batch, max_kl: float, args: Args) -> dict[str, float]:
-    """The natural gradient step of the greatest length within the KL bound, and a line search back from there."""
+    """The natural gradient step of the greatest length within the KL bound, and a line search back from there.
+
+    Eq. 4.2.4 under Eq. 4.2.5, solved as in Schulman et al. 2015, appendix C.
+    """
     old = policy.vector.clone()
     old_mean, old_logstd = policy(old, batch.obs)
     old_logprobs = gaussian_log_prob(old_mean, old_logstd, batch.actions)
@@ -1475,7 +1487,7 @@ def trpo_step(policy: PolicyVector, batch: Batch, max_kl: float, args: Args) -> 
         mean, logstd = policy(vector, batch.obs)
         kl = gaussian_kl(old_mean, old_logstd, mean, logstd).mean()
         gain = objective(vector) - before
-        if kl <= args.kl_slack * max_kl and gain > 0:
+        if kl <= args.kl_slack * max_kl and gain > 0:  # Eq. 4.2.5
             policy.vector.copy_(vector)
             return {"losses/gain": gain.item(), "losses/kl": kl.item(), "charts/halvings": halvings}
     return {"losses/gain": 0.0, "losses/kl": 0.0, "charts/halvings": 10}
@@ -1512,6 +1524,20 @@ def update_discriminator(
         for name, value in metrics.items():
             totals[name] = totals.get(name, 0.0) + value.item() / args.d_steps
     return totals
+
+
+def behaviour_cloning(agent: Agent, experts: Experts, args: Args) -> None:
+    """Fit the policy to the experts' actions, weighted as in Eq. 2.3.1: most likely under it (Adam, 3e-4, batches of 128)."""
+    optimizer = torch.optim.Adam([*agent.actor_mean.parameters(), agent.actor_logstd], 3e-4, fused=True)
+    for _ in range(args.bc_epochs * len(experts.human.obs) // 128):
+        losses = []
+        for demonstrations in experts:
+            obs, actions = demonstrations.sample(128)
+            means = agent.actor_mean(agent.normalize(obs))
+            losses.append(-gaussian_log_prob(means, agent.actor_logstd, actions).mean())
+        optimizer.zero_grad()
+        (args.alpha * losses[0] + (1 - args.alpha) * losses[1]).backward()
+        optimizer.step()
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -1947,7 +1973,7 @@ def start_wandb(args: Args, run_dir: Path) -> None:
         raise UsageError(f"--track: {first_line(error)}") from None
 
 
-def human_episodes(args: Args) -> list[dict[str, np.ndarray]]:
+def human_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
     """Episodes of the recorded or of the synthetic human; none where they have no weight. Raises UsageError."""
     if args.alpha == 1:
         return []
@@ -1958,23 +1984,9 @@ def human_episodes(args: Args) -> list[dict[str, np.ndarray]]:
     return play(SyntheticDriver(games.cars, args.seed), games, seeds, keep=True)
 
 
-def rl_episodes(args: Args) -> list[dict[str, np.ndarray]]:
+def rl_demonstrations(args: Args) -> list[dict[str, np.ndarray]]:
     """Episodes of the RL expert; none where they have no weight. Raises UsageError."""
     return [] if args.alpha == 0 else read_demonstrations(args.demos_rl, args, "--demos-rl")
-
-
-def behaviour_cloning(agent: Agent, experts: Experts, args: Args) -> None:
-    """Fit the policy to the experts' actions, weighted as in Eq. 2.3.1: most likely under it (Adam, 3e-4, batches of 128)."""
-    optimizer = torch.optim.Adam([*agent.actor_mean.parameters(), agent.actor_logstd], 3e-4, fused=True)
-    for _ in range(args.bc_epochs * len(experts.human.obs) // 128):
-        losses = []
-        for demonstrations in experts:
-            obs, actions = demonstrations.sample(128)
-            means = agent.actor_mean(agent.normalise(obs))
-            losses.append(-gaussian_log_prob(means, agent.actor_logstd, actions).mean())
-        optimizer.zero_grad()
-        (args.alpha * losses[0] + (1 - args.alpha) * losses[1]).backward()
-        optimizer.step()
 
 
 def main(args: Args) -> int:
@@ -1984,7 +1996,7 @@ def main(args: Args) -> int:
     if args.capture_video:
         check_video(args.env_id)
     torch.set_num_threads(args.num_threads)
-    human, rl = human_episodes(args), rl_episodes(args)
+    human, rl = human_demonstrations(args), rl_demonstrations(args)
     experts = Experts(*(Demonstrations(part, space, args.frame_skip) for part in (rl or human, human or rl)))
     about_experts = {name: measured(part, args) for name, part in (("rl", rl), ("human", human)) if part}
     run_dir, checkpoint = open_run_dir(args)
@@ -2016,13 +2028,13 @@ def main(args: Args) -> int:
     stop = StopSignal()
 
     agent = Agent(env.observation_space.shape[0], space.shape[0], args.hidden_size)
-    agent.set_normalisation(torch.cat([demonstrations.obs for demonstrations in experts]))
+    agent.set_normalization(torch.cat([demonstrations.obs for demonstrations in experts]))
     agent = agent.to(device)
     for demonstrations in experts:
         demonstrations.move(device)
     policy = PolicyVector(agent)
     value_optimizer = torch.optim.Adam(agent.critic.parameters(), args.value_learning_rate, fused=True)
-    optimizer = torch.optim.Adam(agent.discriminator.parameters(), args.learning_rate, fused=True)
+    d_optimizer = torch.optim.Adam(agent.discriminator.parameters(), args.learning_rate, fused=True)
     players = make_players(args)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))
     iteration, training_seconds, offsets = 0, 0.0, {"episodes": 0, "updates": 0}
@@ -2036,7 +2048,7 @@ def main(args: Args) -> int:
         iteration, training_seconds = checkpoint["iteration"], checkpoint["training_seconds"]
         offsets, round_metrics = checkpoint["offsets"], checkpoint["round_metrics"]
         agent.load_state_dict(checkpoint["agent"])
-        optimizer.load_state_dict(checkpoint["optimizer"]["discriminator"])
+        d_optimizer.load_state_dict(checkpoint["optimizer"]["discriminator"])
         value_optimizer.load_state_dict(checkpoint["optimizer"]["value"])
         rng.bit_generator.state = json.loads(checkpoint["rng"])
         torch.set_rng_state(checkpoint["torch_rng"])
@@ -2058,14 +2070,14 @@ def main(args: Args) -> int:
     while iteration < last_iteration:
         iteration += 1
         rollout = collect(agent, players, space, args, rng)
-        rewards = pay(agent, rollout, space, args.reward_form, device)
+        rewards = imitation_rewards(agent, rollout, space, args.reward_form, device)
         batch = make_batch(agent, rollout, rewards, space, args, device)
         metrics = {"charts/imitation_reward": float(rewards.mean())}
         metrics |= trpo_step(policy, batch, kl_bound(iteration, args), args)
         metrics["losses/value_loss"] = update_values(agent, value_optimizer, batch, args)
         metrics["charts/policy_std"] = agent.actor_logstd.exp().mean().item()
         if iteration % args.g_steps == 0:
-            round_metrics = update_discriminator(agent, optimizer, batch, experts, args)
+            round_metrics = update_discriminator(agent, d_optimizer, batch, experts, args)
         metrics |= round_metrics
 
         for step, episodic_return, length in rollout.episodes:
@@ -2094,7 +2106,7 @@ def main(args: Args) -> int:
                 "offsets": {"episodes": episodes_csv.sync(), "updates": updates_csv.sync()},
                 "round_metrics": round_metrics,
                 "agent": agent.state_dict(),
-                "optimizer": {"discriminator": optimizer.state_dict(), "value": value_optimizer.state_dict()},
+                "optimizer": {"discriminator": d_optimizer.state_dict(), "value": value_optimizer.state_dict()},
                 "rng": json.dumps(rng.bit_generator.state),
                 "torch_rng": torch.get_rng_state(),
                 "players": players.state_dict(),

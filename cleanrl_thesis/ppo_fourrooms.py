@@ -14,7 +14,7 @@ run ends with the same bytes.
 | 19 × 19 cells | `FourRooms19-v0`: agent and goal anywhere, doors as MiniGrid draws them with seed 0 | MiniGrid; the thesis has fixed doors |
 | settings there | `--total-timesteps 9000000 --hidden-size 256 --num-minibatches 32 --update-epochs 3 --learning-rate 7e-4` | ours: 0.85 of 0.86 (one seed); 6,000,000 steps gave 0.84 and 0.76 (two), with the defaults 12,000,000 gave 0.78 |
 | first direction of the agent | drawn | ours; the author's code has it face up |
-| algorithm | PPO; Stable-Baselines3 in the thesis | our own, settings chosen by measurement (the thesis gives none) |
+| algorithm | PPO; Stable-Baselines3 in the thesis | our own; γ, λ, ε, weight of the value loss and bound on the gradient are Stable-Baselines3's defaults, other settings chosen by measurement (the thesis gives none) |
 | demonstrations | sampled actions of a player stopped at 1,100,000 steps: 14.8 steps an episode, in the thesis 14.4 | the finished player hardly varies its ways: 0.015 nats an action; `--demo-mode greedy` takes the best one |
 """
 
@@ -119,39 +119,39 @@ class Args:
 
     # Algorithm
     env_id: Literal["FourRooms11-v0", "FourRooms19-v0"] = "FourRooms11-v0"
-    """the maze of 11 × 11 or of 19 × 19 cells"""
+    """the maze of 11 × 11 cells (the author's code) or of 19 × 19 (MiniGrid)"""
     total_timesteps: int = 3_000_000
-    """environment steps, rounded down to whole batches"""
+    """environment steps, rounded down to whole batches (ours)"""
     frame_side: int | None = None
-    """pixels of the side of the frames that the agent sees; default: two for each cell (demonstrations have 64)"""
+    """pixels of the side of the frames that the agent sees, demonstrations have 64; default: two for each cell (ours)"""
     channels: int = 16
-    """channels of the first convolution; the second has twice as many"""
+    """channels of the first convolution; the second has twice as many (ours)"""
     hidden_size: int = 128
-    """units of the hidden layer"""
+    """units of the hidden layer (ours)"""
     num_envs: int = 256
-    """games side by side"""
+    """games side by side (ours)"""
     num_steps: int = 64
-    """steps of each game per batch"""
+    """steps of each game per batch (ours)"""
     learning_rate: float = 5e-4
-    """Adam's learning rate"""
+    """Adam's learning rate (ours)"""
     anneal_lr: bool = True
-    """anneal the learning rate linearly to 0"""
+    """anneal the learning rate linearly to 0 (ours)"""
     gamma: float = 0.99
-    """discount factor γ"""
+    """discount factor γ (Stable-Baselines3)"""
     gae_lambda: float = 0.95
-    """λ of the generalised advantage estimation"""
+    """λ of the generalised advantage estimation, A(τ, V, t) of Eq. 4.2.3 (Stable-Baselines3)"""
     num_minibatches: int = 64
-    """minibatches per update iteration"""
+    """minibatches per update iteration (ours)"""
     update_epochs: int = 4
-    """update iterations per batch"""
+    """update iterations per batch (ours)"""
     clip_coef: float = 0.2
-    """ε of the clipped objective"""
+    """ε of the clipped objective, Eq. 4.2.6 (Stable-Baselines3)"""
     ent_coef: float = 0.01
-    """weight of the entropy"""
+    """weight of the entropy (ours)"""
     vf_coef: float = 0.5
-    """weight of the value loss"""
+    """weight of the value loss (Stable-Baselines3)"""
     max_grad_norm: float = 0.5
-    """bound on the norm of the gradient; inf for none"""
+    """bound on the norm of the gradient; inf for none (Stable-Baselines3)"""
 
     # to be filled in runtime
     batch_size: tyro.conf.Suppress[int] = 0

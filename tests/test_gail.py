@@ -213,8 +213,8 @@ def test_demonstrations_are_normalised_and_within_bounds():
     demonstrations = gail.Demonstrations([episode], space, 1)
     assert demonstrations.actions.abs().max() == 1 and len(demonstrations.obs) == 1_000
     agent = gail.Agent(4, 2, 8)
-    agent.set_normalisation(demonstrations.obs)
-    normalised = agent.normalise(demonstrations.obs)
+    agent.set_normalization(demonstrations.obs)
+    normalised = agent.normalize(demonstrations.obs)
     assert normalised.mean(0).abs().max() < 1e-5 and (normalised.std(0) - 1).abs().max() < 1e-3
     obs, actions = demonstrations.sample(50)
     for row, action in zip(obs, actions):
@@ -398,17 +398,17 @@ def test_a_batch_by_hand():
     """Rewards and values of what the environment had, actions within bounds; time-outs are no ends."""
     torch.manual_seed(0)
     agent, args = gail.Agent(OBS, 1, 8), gail.Args(gamma=0.9, gae_lambda=0.8)
-    agent.set_normalisation(1 + torch.randn(99, OBS))
+    agent.set_normalization(1 + torch.randn(99, OBS))
     obs, next_obs = np.random.default_rng(0).standard_normal((2, 3, 2, OBS)).astype(np.float32)
     ended, terminated = np.zeros((2, 3, 2), bool)
     ended[0, 1] = ended[1, 0] = terminated[0, 1] = True
     rollout = gail.Rollout(obs, np.full((3, 2, 1), 3, np.float32), next_obs, terminated, ended, [])
-    rewards = gail.pay(agent, rollout, SPACE, "positive", torch.device("cpu"))
+    rewards = gail.imitation_rewards(agent, rollout, SPACE, "positive", torch.device("cpu"))
     logits = agent.logits(agent.pairs(torch.from_numpy(obs).flatten(0, 1), torch.ones(6, 1)))
     assert np.allclose(rewards.ravel(), -torch.sigmoid(logits).log().detach(), atol=1e-5)
     batch = gail.make_batch(agent, rollout, rewards, SPACE, args, torch.device("cpu"))
     with torch.no_grad():
-        flat = (agent.normalise(torch.from_numpy(each).flatten(0, 1)) for each in (obs, next_obs))
+        flat = (agent.normalize(torch.from_numpy(each).flatten(0, 1)) for each in (obs, next_obs))
         values, next_values = (agent.value(each).numpy().reshape(3, 2) for each in flat)
     advantages = np.zeros((3, 2))
     for i in range(2):
@@ -438,13 +438,13 @@ def test_the_student_acts_as_it_is_trained():
     """In rollouts and in evaluation: the mean of normalised observations, and noise of the policy's deviation."""
     torch.manual_seed(0)
     agent, space = gail.Agent(65, 2, 8), gym.spaces.Box(-9, 9, (2,))
-    agent.set_normalisation(3 + 2 * torch.randn(500, 65))
+    agent.set_normalization(3 + 2 * torch.randn(500, 65))
     with torch.no_grad():
         agent.actor_logstd.fill_(-1.0)
         agent.actor_mean[4].weight.mul_(50)
     obs = 3 + 8 * torch.randn(4_000, 65)
     with torch.no_grad():
-        mean = agent.actor_mean(agent.normalise(obs)).numpy()
+        mean = agent.actor_mean(agent.normalize(obs)).numpy()
     assert np.allclose(gail.make_policy(agent, "greedy", space, 0)(obs.numpy()), mean, atol=1e-4)
     noise = gail.make_policy(agent, "sampled", space, 0)(obs.numpy()) - mean
     assert noise.std() == pytest.approx(math.exp(-1), rel=0.03)
@@ -453,7 +453,7 @@ def test_the_student_acts_as_it_is_trained():
     players.start()
     rollout = gail.collect(agent, players, gail.make_env(args.env_id).action_space, args, np.random.default_rng(0))
     with torch.no_grad():
-        mean = agent.actor_mean(agent.normalise(torch.from_numpy(rollout.obs))).numpy()
+        mean = agent.actor_mean(agent.normalize(torch.from_numpy(rollout.obs))).numpy()
     rng = np.random.default_rng(0)
     noise = np.stack([rng.standard_normal((3, 2), np.float32) for _ in range(4)])
     assert np.allclose((rollout.actions - mean) / math.exp(-1), noise, atol=1e-3)
