@@ -2,12 +2,14 @@
 
 import ast
 import importlib
+import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 from conftest import ROOT, SMALL, run
@@ -53,11 +55,85 @@ def test_lock_has_no_addresses():
     assert "://" not in text and "--index" not in text and "--find-links" not in text
 
 
+DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "ale_py": "ale-py",
+    "cv2": "opencv-python-headless",
+    "imageio_ffmpeg": "imageio-ffmpeg",
+}
+DISTRIBUTIONS |= {"torch.utils.tensorboard": "tensorboard", "gymnasium.envs.mujoco": "mujoco"}
+OPTIONAL = {
+    "wandb": "--track says that it is missing",
+    "moviepy": "--capture-video says that it is missing",
+    "minari": "--export-minari says that it is missing",
+    "pydantic": "comes with fastapi",
+}
+
+
+def distributions(source: str) -> tuple[set[str], set[str]]:
+    """What has to be installed for the imports of a script: for those of the file, and for those within functions."""
+    needed = set(), set()
+
+    def look(node: ast.AST, inside: bool) -> None:
+        modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        modules += [node.module] if isinstance(node, ast.ImportFrom) else []
+        for module in modules:
+            packages = {name for part, name in DISTRIBUTIONS.items() if f"{module}.".startswith(f"{part}.")}
+            packages.add(DISTRIBUTIONS.get(module.split(".")[0], module.split(".")[0]))
+            needed[inside].update(packages - sys.stdlib_module_names)
+        for child in ast.iter_child_nodes(node):
+            look(child, inside or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+
+    look(ast.parse(source), False)
+    return needed
+
+
+@pytest.mark.parametrize("path", METHODS, ids=lambda path: path.name)
+def test_script_metadata_has_what_is_imported(path):
+    """All of it but what is optional, and that within functions; a method's names nothing else."""
+    source = path.read_text()
+    block = {canonicalize_name(Requirement(line).name) for line in script_metadata(source)["dependencies"]}
+    at_the_top, within = distributions(source)
+    assert {"numpy", "tyro"} <= at_the_top <= block
+    assert within <= block | OPTIONAL.keys()
+    assert path in TOOLS or block <= at_the_top | within
+
+
+def test_imports_are_found():
+    source = (
+        "import os.path, cv2\nif True:\n    from torch.utils.tensorboard import X\ndef f():\n    import wandb.sdk as w"
+    )
+    assert distributions(source) == ({"opencv-python-headless", "torch", "tensorboard"}, {"wandb"})
+
+
+HELP = """
+import os, runpy, sys
+sys.modules["cleanrl_thesis"] = None  # which is installed here
+for path in sys.argv[1:]:
+    os.chdir(os.path.dirname(path))
+    sys.argv = [path, "--help"]
+    try:
+        runpy.run_path(path, run_name="__main__")
+    except SystemExit as end:
+        print(os.path.basename(path), "ends with", end.code)
+"""
+
+
 def test_copied_alone_into_an_empty_folder(tmp_path, small_run):
+    """Each file into a folder of its own, where it says how it is used and writes nothing; one of them trains, too."""
+    copies = []
     for path in METHODS:
-        shutil.copy(path, tmp_path / path.name)
-    run(*SMALL, "--run-dir", "run", cwd=tmp_path, script=tmp_path / "ppo_continuous_kle.py", PYTHONSAFEPATH="1")
-    assert (tmp_path / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
+        (tmp_path / path.stem).mkdir()
+        copies.append(shutil.copy(path, tmp_path / path.stem))
+    line = [sys.executable, "-B", "-c", HELP, *copies]
+    done = subprocess.run(line, cwd=tmp_path, env={**os.environ, "PYTHONSAFEPATH": "1"}, capture_output=True, text=True)
+    ends = [line for line in done.stdout.splitlines() if " ends with " in line]
+    assert ends == [f"{path.name} ends with 0" for path in METHODS], done.stdout + done.stderr
+    assert done.stdout.count("--run-dir") >= len(METHODS) - len(TOOLS)
+    assert sorted(tmp_path.glob("*/*")) == sorted(map(Path, copies))
+    script = tmp_path / "ppo_continuous_kle" / "ppo_continuous_kle.py"
+    run(*SMALL, "--run-dir", "run", cwd=script.parent, script=script, PYTHONSAFEPATH="1")
+    assert (script.parent / "run" / "updates.csv").read_bytes() == (small_run / "updates.csv").read_bytes()
 
 
 def test_package_is_importable_from_anywhere(tmp_path):
