@@ -24,7 +24,7 @@ author.
 | random play at first | 50,000 steps | 1,000,000 steps, with a reward or more at each of 64 goal cells; after 200,000 there are 10 to 17 without one, which are never sought |
 | rates | 2e-4, 4e-5, 1e-4 | 3e-3 for the model (1e-3 did as well *), 1e-3 for actor and critic |
 | rewards | tanh, weight 1 | as they are, weight 10 |
-| layers | SiLU, where DreamerV2 has ELU: twice as fast on large batches | the same, normalised in the heads |
+| layers | SiLU, where DreamerV2 has ELU, which is slower on large batches | the same, normalised in the heads |
 
 Where there is a *: one run, 60,000 steps with updates (`benchmark/results/dreamer/xs/table.md`).
 """
@@ -647,6 +647,7 @@ class GRUCell(nn.Module):
         self.norm = nn.LayerNorm(3 * state_size)
 
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Input (N, input_size) and state (N, state_size) -> the next state (N, state_size)."""
         reset, candidate, update = self.norm(self.linear(torch.cat([x, state], -1))).chunk(3, -1)
         update = torch.sigmoid(update - 1)
         return update * torch.tanh(torch.sigmoid(reset) * candidate) + (1 - update) * state
@@ -890,7 +891,10 @@ def warm_up(args: Args, updates: int) -> float:
 def world_model_loss(
     model: WorldModel, data: Chunks, updates: int
 ) -> tuple[torch.Tensor, State, dict[str, torch.Tensor]]:
-    """The model's loss per step after so many updates, its states (T, B, ...), and the parts of the loss."""
+    """The world model's loss of DreamerV2 (Hafner et al. 2021, section 2.1) per step after so many updates.
+
+    Returns it, the states (T, B, ...), and the parts of the loss. The entropy of the codes, in the warm-up, is ours.
+    """
     args = model.args
     frames = model.normalize(data.frames.flatten(0, 1))  # (T · B, side, side, 3)
     embed = model.embedding(frames).unflatten(0, data.first.shape)
@@ -948,9 +952,11 @@ class Behaviour(nn.Module):
         return self.actor(features).float()
 
     def value(self, features: torch.Tensor) -> torch.Tensor:
+        """The critic's V of states with features (..., F), (...)."""
         return self.critic(features).squeeze(-1).float()
 
     def slow_value(self, features: torch.Tensor) -> torch.Tensor:
+        """The slow critic's, (..., F) -> (...)."""
         return self.slow_critic(features).squeeze(-1).float()
 
 
@@ -981,7 +987,10 @@ def imagine(model: nn.Module, behaviour: Behaviour, state: NamedTuple, horizon: 
 def lambda_return(
     rewards: torch.Tensor, discounts: torch.Tensor, values: torch.Tensor, gae_lambda: float
 ) -> torch.Tensor:
-    """G_h = r_{h+1} + d_{h+1} ((1 − λ) V_{h+1} + λ G_{h+1}), G_H = V_H; rewards, discounts (H, N), values (H + 1, N) -> (H, N)."""
+    """V_λ^h of Eq. 3.3.8, as in DreamerV2: G_h = r_{h+1} + d_{h+1} ((1 − λ) V_{h+1} + λ G_{h+1}), G_H = V_H.
+
+    rewards and discounts (H, N), values (H + 1, N) -> (H, N).
+    """
     returns, following = [], values[-1]
     for h in reversed(range(len(rewards))):
         following = rewards[h] + discounts[h] * ((1 - gae_lambda) * values[h + 1] + gae_lambda * following)
@@ -1012,7 +1021,7 @@ def behaviour_loss(
     critic_loss = (weights * 0.5 * (behaviour.value(dream.features[:-1]) - returns).square()).mean()  # Eq. 3.3.8
     losses = {"actor": actor_loss, "critic": critic_loss}
     parts = {**losses, "entropy": entropy.mean(), "advantage_std": advantages.std(correction=0)}
-    parts |= {"dream_return": returns.mean(), "dream_reward": dream.rewards.max()}
+    parts |= {"dream_return": returns.mean(), "dream_reward": dream.rewards.max()}  # the greatest one, not the mean
     return losses, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
 
@@ -1123,7 +1132,7 @@ def compile_steps(learner: Learner, data: Chunks) -> bool:
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep what is freed: each large tensor comes from the kernel anew otherwise, up to a fifth of a step of `--size m`."""
+    """Have glibc keep what is freed: otherwise each large tensor's memory comes from the kernel anew, page by page."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries have none
     if mallopt is not None:
         mallopt(-4, 0)  # M_MMAP_MAX: no block of its own for a large tensor
@@ -1230,6 +1239,7 @@ class Collector:
         self.replay.add(self.games, final["state"], action=actions, reward=rewards, terminal=terminated)
         ended = np.flatnonzero(is_over)
         self.replay.add(ended, infos["state"][ended], first=1)
+        # the last reward is the whole return: FourRooms pays at the goal alone
         return [(i, float(rewards[i]), int(lengths[i])) for i in ended.tolist()]
 
     def state_dict(self) -> dict:
@@ -1690,7 +1700,7 @@ def main(args: Args) -> int:
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(args.num_threads)
-    torch.set_flush_denormal(True)  # denormal numbers make Adam three times slower
+    torch.set_flush_denormal(True)  # Adam slows down on denormal numbers, means of gradients that have vanished
     keep_freed_memory()
     if args.cuda and not torch.cuda.is_available():
         print("--cuda: no GPU here, goes on with the CPU", file=sys.stderr)

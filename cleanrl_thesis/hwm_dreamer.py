@@ -683,6 +683,7 @@ class GRUCell(nn.Module):
         self.norm = nn.LayerNorm(3 * state_size)
 
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Input (N, input_size) and state (N, state_size) -> the next state (N, state_size)."""
         reset, candidate, update = self.norm(self.linear(torch.cat([x, state], -1))).chunk(3, -1)
         update = torch.sigmoid(update - 1)
         return update * torch.tanh(torch.sigmoid(reset) * candidate) + (1 - update) * state
@@ -826,6 +827,7 @@ class Head(nn.Module):
                 self.outer.bias[variables:] += args.std_bias
 
     def forward(self, features: torch.Tensor, embed: torch.Tensor | float = 0.0) -> Normal | Categorical:
+        """Features (..., input_size), embed (..., hidden) -> of `variables` numbers, or of as many one-hot codes."""
         x = self.outer(F.silu(self.inner(features) + embed)).float()
         if self.classes > 1:
             return Categorical(x.unflatten(-1, (-1, self.classes)))
@@ -841,6 +843,7 @@ class Recurrence(nn.Module):
         self.inner, self.cell = nn.Linear(input_size, hidden_size), GRUCell(hidden_size, state_size)
 
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Input (N, input_size) and state (N, state_size) -> the next state (N, state_size)."""
         return self.cell(F.silu(self.inner(x)), state)
 
 
@@ -1158,9 +1161,11 @@ class Behaviour(nn.Module):
         return self.actor(features).float()
 
     def value(self, features: torch.Tensor) -> torch.Tensor:
+        """The critic's V of states with features (..., F), (...)."""
         return self.critic(features).squeeze(-1).float()
 
     def slow_value(self, features: torch.Tensor) -> torch.Tensor:
+        """The slow critic's, (..., F) -> (...)."""
         return self.slow_critic(features).squeeze(-1).float()
 
 
@@ -1191,7 +1196,10 @@ def imagine(model: nn.Module, behaviour: Behaviour, state: NamedTuple, horizon: 
 def lambda_return(
     rewards: torch.Tensor, discounts: torch.Tensor, values: torch.Tensor, gae_lambda: float
 ) -> torch.Tensor:
-    """G_h = r_{h+1} + d_{h+1} ((1 − λ) V_{h+1} + λ G_{h+1}), G_H = V_H; rewards, discounts (H, N), values (H + 1, N) -> (H, N)."""
+    """V_λ^h of Eq. 3.3.8, as in DreamerV2: G_h = r_{h+1} + d_{h+1} ((1 − λ) V_{h+1} + λ G_{h+1}), G_H = V_H.
+
+    rewards and discounts (H, N), values (H + 1, N) -> (H, N).
+    """
     returns, following = [], values[-1]
     for h in reversed(range(len(rewards))):
         following = rewards[h] + discounts[h] * ((1 - gae_lambda) * values[h + 1] + gae_lambda * following)
@@ -1222,7 +1230,7 @@ def behaviour_loss(
     critic_loss = (weights * 0.5 * (behaviour.value(dream.features[:-1]) - returns).square()).mean()  # Eq. 3.3.8
     losses = {"actor": actor_loss, "critic": critic_loss}
     parts = {**losses, "entropy": entropy.mean(), "advantage_std": advantages.std(correction=0)}
-    parts |= {"dream_return": returns.mean(), "dream_reward": dream.rewards.max()}
+    parts |= {"dream_return": returns.mean(), "dream_reward": dream.rewards.max()}  # the greatest one, not the mean
     return losses, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
 
@@ -1333,7 +1341,7 @@ def compile_steps(learner: Learner, data: Chunks) -> bool:
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep what is freed: each large tensor comes from the kernel anew otherwise, up to a fifth of a step of `--size m`."""
+    """Have glibc keep what is freed: otherwise each large tensor's memory comes from the kernel anew, page by page."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries have none
     if mallopt is not None:
         mallopt(-4, 0)  # M_MMAP_MAX: no block of its own for a large tensor
@@ -1440,6 +1448,7 @@ class Collector:
         self.replay.add(self.games, final["state"], action=actions, reward=rewards, terminal=terminated)
         ended = np.flatnonzero(is_over)
         self.replay.add(ended, infos["state"][ended], first=1)
+        # the last reward is the whole return: FourRooms pays at the goal alone
         return [(i, float(rewards[i]), int(lengths[i])) for i in ended.tolist()]
 
     def state_dict(self) -> dict:
@@ -1900,7 +1909,7 @@ def main(args: Args) -> int:
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(args.num_threads)
-    torch.set_flush_denormal(True)  # denormal numbers make Adam three times slower
+    torch.set_flush_denormal(True)  # Adam slows down on denormal numbers, means of gradients that have vanished
     keep_freed_memory()
     if args.cuda and not torch.cuda.is_available():
         print("--cuda: no GPU here, goes on with the CPU", file=sys.stderr)

@@ -684,6 +684,7 @@ class GRUCell(nn.Module):
         self.norm = nn.LayerNorm(3 * state_size)
 
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Input (N, input_size) and state (N, state_size) -> the next state (N, state_size)."""
         reset, candidate, update = self.norm(self.linear(torch.cat([x, state], -1))).chunk(3, -1)
         update = torch.sigmoid(update - 1)
         return update * torch.tanh(torch.sigmoid(reset) * candidate) + (1 - update) * state
@@ -827,6 +828,7 @@ class Head(nn.Module):
                 self.outer.bias[variables:] += args.std_bias
 
     def forward(self, features: torch.Tensor, embed: torch.Tensor | float = 0.0) -> Normal | Categorical:
+        """Features (..., input_size), embed (..., hidden) -> of `variables` numbers, or of as many one-hot codes."""
         x = self.outer(F.silu(self.inner(features) + embed)).float()
         if self.classes > 1:
             return Categorical(x.unflatten(-1, (-1, self.classes)))
@@ -842,6 +844,7 @@ class Recurrence(nn.Module):
         self.inner, self.cell = nn.Linear(input_size, hidden_size), GRUCell(hidden_size, state_size)
 
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Input (N, input_size) and state (N, state_size) -> the next state (N, state_size)."""
         return self.cell(F.silu(self.inner(x)), state)
 
 
@@ -1169,15 +1172,19 @@ class Behaviour(nn.Module):
         return self.high_actor(features[..., : self.z_size]).float()
 
     def value(self, features: torch.Tensor, skill: torch.Tensor) -> torch.Tensor:
+        """V^L(w, z, e), (...); features (..., F), skill (..., K) one-hot."""
         return self.critic(torch.cat([features, skill], -1)).squeeze(-1).float()
 
     def slow_value(self, features: torch.Tensor, skill: torch.Tensor) -> torch.Tensor:
+        """The slow critic's V^L, of the same shapes."""
         return self.slow_critic(torch.cat([features, skill], -1)).squeeze(-1).float()
 
     def high_value(self, features: torch.Tensor) -> torch.Tensor:
+        """V^H(z), (..., F) -> (...); the features of z stand first."""
         return self.high_critic(features[..., : self.z_size]).squeeze(-1).float()
 
     def slow_high_value(self, features: torch.Tensor) -> torch.Tensor:
+        """The slow critic's V^H, of the same shapes."""
         return self.slow_high_critic(features[..., : self.z_size]).squeeze(-1).float()
 
     def choose(self, features: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
@@ -1220,7 +1227,10 @@ def imagine(model: nn.Module, behaviour: Behaviour, state: NamedTuple, horizon: 
 def lambda_return(
     rewards: torch.Tensor, discounts: torch.Tensor, values: torch.Tensor, gae_lambda: float
 ) -> torch.Tensor:
-    """G_h = r_{h+1} + d_{h+1} ((1 − λ) V_{h+1} + λ G_{h+1}), G_H = V_H; rewards, discounts (H, N), values (H + 1, N) -> (H, N)."""
+    """V_λ^h of Eq. 3.3.8, as in DreamerV2: G_h = r_{h+1} + d_{h+1} ((1 − λ) V_{h+1} + λ G_{h+1}), G_H = V_H.
+
+    rewards and discounts (H, N), values (H + 1, N) -> (H, N).
+    """
     returns, following = [], values[-1]
     for h in reversed(range(len(rewards))):
         following = rewards[h] + discounts[h] * ((1 - gae_lambda) * values[h + 1] + gae_lambda * following)
@@ -1292,7 +1302,7 @@ def behaviour_loss(
     }
     parts |= {
         "dream_return": returns.mean(),
-        "dream_reward": dream.rewards.max(),
+        "dream_reward": dream.rewards.max(),  # the greatest one, not the mean
         "dream_reads": dream.decides[1:].mean(),
     }
     usage = behaviour.high_policy(dream.features[0]).softmax(-1).mean(0)
@@ -1421,7 +1431,7 @@ def compile_steps(learner: Learner, data: Chunks) -> bool:
 
 
 def keep_freed_memory() -> None:
-    """Have glibc keep what is freed: each large tensor comes from the kernel anew otherwise, up to a fifth of a step of `--size m`."""
+    """Have glibc keep what is freed: otherwise each large tensor's memory comes from the kernel anew, page by page."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # other C libraries have none
     if mallopt is not None:
         mallopt(-4, 0)  # M_MMAP_MAX: no block of its own for a large tensor
@@ -1531,6 +1541,7 @@ class Collector:
         self.replay.add(self.games, final["state"], action=actions, reward=rewards, terminal=terminated)
         ended = np.flatnonzero(is_over)
         self.replay.add(ended, infos["state"][ended], first=1)
+        # the last reward is the whole return: FourRooms pays at the goal alone
         return [(i, float(rewards[i]), int(lengths[i])) for i in ended.tolist()]
 
     def state_dict(self) -> dict:
@@ -1993,7 +2004,7 @@ def main(args: Args) -> int:
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(args.num_threads)
-    torch.set_flush_denormal(True)  # denormal numbers make Adam three times slower
+    torch.set_flush_denormal(True)  # Adam slows down on denormal numbers, means of gradients that have vanished
     keep_freed_memory()
     if args.cuda and not torch.cuda.is_available():
         print("--cuda: no GPU here, goes on with the CPU", file=sys.stderr)

@@ -422,6 +422,7 @@ class GRUCell(nn.Module):
         self.norm = nn.LayerNorm(3 * state_size)
 
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+        """Input (N, input_size) and state (N, state_size) -> the next state (N, state_size)."""
         reset, candidate, update = self.norm(self.linear(torch.cat([x, state], -1))).chunk(3, -1)
         update = torch.sigmoid(update - 1)
         return update * torch.tanh(torch.sigmoid(reset) * candidate) + (1 - update) * state
@@ -451,6 +452,7 @@ class NormalHead(nn.Module):
             self.layers[-1].bias[size:] += std_bias
 
     def forward(self, features: torch.Tensor) -> Normal:
+        """Features (..., input_size) -> mean and standard deviation, (..., size) each."""
         mean, std = self.layers(features).chunk(2, -1)
         return Normal(mean, 2 * torch.sigmoid(std / 2) + 0.1)
 
