@@ -5,14 +5,26 @@ python benchmark/fourrooms_steps.py FourRooms11-v0 1 5000            # one game 
 python benchmark/fourrooms_steps.py FourRooms11-v0 256 1000          # 256 side by side, 1,000 steps each
 """
 
-import sys
 import time
+from dataclasses import dataclass
 
 import gymnasium as gym
 import minigrid.wrappers
+import tyro
+from common import UsageError, run_main
 from sb3_timing import report
 
 import cleanrl_thesis.ppo_fourrooms  # noqa: F401, registers the mazes
+
+
+@dataclass
+class Args:
+    env_id: tyro.conf.Positional[str]
+    """FourRooms11-v0, FourRooms19-v0, or one of MiniGrid's"""
+    games: tyro.conf.Positional[int]
+    """games side by side"""
+    steps: tyro.conf.Positional[int]
+    """steps of each"""
 
 
 def time_single(env: gym.Env, steps: int) -> float:
@@ -36,15 +48,18 @@ def time_many(envs: gym.vector.VectorEnv, steps: int) -> float:
     return envs.num_envs * steps / (time.perf_counter() - start)
 
 
-def main(env_id: str, games: int, steps: int) -> None:
-    if env_id.startswith("MiniGrid"):
-        env = minigrid.wrappers.RGBImgObsWrapper(gym.make(env_id, highlight=False, disable_env_checker=True))
-        report(time_single(env, steps))
-    elif games == 1:
-        report(time_single(gym.make(env_id, disable_env_checker=True), steps))
+def main(args: Args) -> None:
+    if args.env_id not in gym.registry:
+        raise UsageError(f"{args.env_id}: no environment of this name")
+    if args.env_id.startswith("MiniGrid"):
+        env = minigrid.wrappers.RGBImgObsWrapper(gym.make(args.env_id, highlight=False, disable_env_checker=True))
+        report(time_single(env, args.steps))
+    elif args.games == 1:
+        report(time_single(gym.make(args.env_id, disable_env_checker=True), args.steps))
     else:
-        report(time_many(gym.make_vec(env_id, games, vectorization_mode="vector_entry_point"), steps))
+        envs = gym.make_vec(args.env_id, args.games, vectorization_mode="vector_entry_point")
+        report(time_many(envs, args.steps))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    run_main(main, Args, __doc__)

@@ -153,19 +153,9 @@ def test_noise_on_actions_goes_on_through_an_episode(tmp_path, monkeypatch):
     """`--perturb-interval` is of perturbed actors alone; the noise begins with each episode."""
     begun = []
     monkeypatch.setattr(ddpg.ActionNoise, "begin", lambda noise, i: begun.append(i))
-    flags = [
-        "--env-id",
-        "Pendulum-v1",
-        "--noise",
-        "ou",
-        "--total-timesteps",
-        1_500,
-        "--num-envs",
-        5,
-        "--batch-size",
-        16,
-    ]
-    flags += ["--perturb-interval", 10, "--keep-best-every", 0, "--eval-episodes", 1, "--run-dir", tmp_path / "run"]
+    flags = ["--env-id", "Pendulum-v1", "--noise", "ou", "--total-timesteps", 1_500, "--num-envs", 5]
+    flags += ["--batch-size", 16, "--perturb-interval", 10, "--keep-best-every", 0, "--eval-episodes", 1]
+    flags += ["--run-dir", tmp_path / "run"]
     assert ddpg.cli([str(flag) for flag in flags]) == 0
     episodes = ddpg.read_episodes(tmp_path / "run")
     assert len(episodes) >= 5 and len(begun) in (len(episodes), len(episodes) + 5)

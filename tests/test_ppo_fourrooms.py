@@ -16,6 +16,8 @@ from cleanrl_thesis import ppo_fourrooms as method
 sys.path.append(str(ROOT / "benchmark"))
 import fourrooms_cuts  # noqa: E402
 import fourrooms_players  # noqa: E402
+import fourrooms_steps  # noqa: E402
+from common import run_main  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "ppo_fourrooms.py"
 # 6 batches of 128 steps, a checkpoint after each
@@ -327,6 +329,25 @@ def test_table_of_the_players(small_run, tmp_path):
     line = fourrooms_players.table(rows).splitlines()[2]
     assert line.startswith("| FourRooms11-v0 | 1 | 768 | 0 |")
     assert f"| {evaluation['mean'] / evaluation['optimal']:.3f} |" in line
+
+
+@pytest.mark.parametrize(
+    "words, complaint",
+    [([], "required"), (["FourRooms11-v0", "0", "9"], "0: must be at least 1"), (["Chess", "1", "9"], "Chess: no env")],
+)
+def test_wrong_words_for_the_timing_are_one_line(words, complaint, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["fourrooms_steps.py", *words])
+    with pytest.raises(SystemExit) as stop:
+        run_main(fourrooms_steps.main, fourrooms_steps.Args, fourrooms_steps.__doc__)
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and err.startswith("error: ") and complaint in err and err.count("\n") == 1
+
+
+def test_the_timing_takes_one_game_and_many(monkeypatch, capsys):
+    for games in (1, 8):
+        monkeypatch.setattr(sys, "argv", ["fourrooms_steps.py", "FourRooms11-v0", str(games), "20"])
+        run_main(fourrooms_steps.main, fourrooms_steps.Args, fourrooms_steps.__doc__)
+        assert json.loads(capsys.readouterr().out)["steps_per_second"] > 0
 
 
 def play_once(player: fourrooms_cuts.Player, pose: int, goal: int, ends, rng) -> tuple[int, int]:
