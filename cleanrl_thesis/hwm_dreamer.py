@@ -1954,6 +1954,8 @@ def main(args: Args) -> int:
                 ended = step + game + 1
                 row = {"global_step": ended, "episodic_return": episodic_return, "episodic_length": length}
                 episodes_csv.write(row)
+                charts = {"charts/episodic_return": episodic_return, "charts/episodic_length": length}
+                add_scalars(writer, charts, ended)
                 returns.append(episodic_return)
             # learn from chunks of all that was played: the model, and in its dreams the behaviour
             due = max(0, step + args.num_envs - args.prefill) // args.train_frequency
@@ -1971,8 +1973,8 @@ def main(args: Args) -> int:
             is_due = global_step % COMPARISON == 0
             unknown = {"eval/real_return": math.nan, "eval/dreamed_return": math.nan}
             compared = compare_dream(learner, args) if is_due else unknown
-            metrics = {"charts/episodic_return": mean_return, **metrics, **compared}
-            updates_csv.write({"global_step": global_step, **metrics})
+            metrics |= compared
+            updates_csv.write({"global_step": global_step, "charts/episodic_return": mean_return, **metrics})
             if not all(math.isfinite(value) for name, value in metrics.items() if name.startswith("losses/")):
                 raise RunError(f"step {global_step}: a loss is no longer finite ({metrics})")
         now = time.perf_counter()

@@ -1359,7 +1359,7 @@ def main(args: Args) -> int:
         measured["attempts"] = [{"objective": value, **each} for value, each in zip(objectives, scores)]
         measured |= {"agreed": agreed} if len(models) > 1 else {}
         model.load_state_dict(models[int(np.argmax(objectives))])
-    finish_run(model, measured, episodes, args, run_dir, update, training_seconds, device)
+    finish_run(model, measured, episodes, args, run_dir, update, training_seconds, device, writer)
     writer.close()
     return 0
 
@@ -1373,10 +1373,13 @@ def finish_run(
     update: int,
     seconds,
     device,
+    writer,
 ) -> None:
     """Measure, draw Fig. 3.4, save what was asked for, and write `result.json` last; `measured` is of all attempts."""
     segmentation = {**evaluate(model, episodes, args, device), **measured}
     write_json(run_dir / "segmentation.json", segmentation)
+    scores = {f"eval/{name}": value for name, value in segmentation["prior"].items() if isinstance(value, float)}
+    add_scalars(writer, scores, update)
     draw_figure(model, longest_way(episodes.heldout), device, run_dir / "figure_3_4.png")
     if args.save_model:
         content = safetensors.torch.save(model.state_dict(), {"args": json.dumps(arguments(args))})

@@ -640,6 +640,36 @@ def test_small_run_leaves_its_records(small_run):
         assert (small_run / name).read_bytes()[1:4] == b"PNG"
 
 
+def scalars(folder) -> dict[str, list[tuple[int, float]]]:
+    """What TensorBoard has: (step, value) of each event of each name."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0}).Reload()
+    return {name: [(event.step, event.value) for event in events.Scalars(name)] for name in events.Tags()["scalars"]}
+
+
+@pytest.mark.parametrize("name", ["dreamer_v2", "hwm_dreamer", "hwm_hrl_dreamer"])
+def test_tensorboard_has_every_episode_and_update(name, tmp_path):
+    """Of random play too, each at its step; and the columns of updates.csv but for the mean of a row's episodes."""
+    flags = ["--batch-size", 1, "--chunk-length", 4, "--horizon", 2, "--prefill", 500, "--total-timesteps", 1000]
+    flags += ["--num-envs", 2, "--train-frequency", 100, "--eval-episodes", 1, "--run-dir", "run"]
+    run(*flags, cwd=tmp_path, script=ROOT / "cleanrl_thesis" / f"{name}.py")
+    folder = tmp_path / "run"
+    found = scalars(folder)
+    episodes = np.genfromtxt(folder / "episodes.csv", delimiter=",", names=True)
+    for column in ("episodic_return", "episodic_length"):
+        written = [(int(step), np.float32(value)) for step, value in zip(episodes["global_step"], episodes[column])]
+        assert found[f"charts/{column}"] == written and written[0][0] <= 500, column
+    header, *rows = csv.reader((folder / "updates.csv").read_text().splitlines())
+    for i, column in enumerate(header):
+        if column not in ("global_step", "charts/episodic_return"):
+            steps, values = zip(*found[column])
+            assert steps == tuple(int(row[0]) for row in rows)
+            np.testing.assert_allclose(values, [float(row[i]) for row in rows], rtol=1e-6)
+    evaluation = json.loads((folder / "evaluation.json").read_text())
+    assert found["eval/episodic_return_mean"][0][1] == np.float32(evaluation["mean"]) and found["charts/SPS"]
+
+
 def assert_no_game_of_training_is_scored(folder, method) -> None:
     """The seeds of its evaluation are none of those with which its games begin, nor any of their streams."""
     scored = set(json.loads((folder / "evaluation.json").read_text())["seeds"])

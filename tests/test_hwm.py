@@ -655,6 +655,19 @@ def test_episodes_read_are_those_written(demos):
     assert torch.equal(chunk.frames[2, 0], sequence.frames[5]) and chunk.actions.shape == (4, 2)
 
 
+def test_tensorboard_has_the_updates_and_the_measures(small_run):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(small_run)).Reload()
+    rows = list(csv.DictReader((small_run / "updates.csv").read_text().splitlines()))
+    written = [(event.step, np.float32(event.value)) for event in events.Scalars("losses/kl_z")]
+    assert written == [(int(row["global_step"]), np.float32(row["losses/kl_z"])) for row in rows]
+    measures = json.loads((small_run / "segmentation.json").read_text())["prior"]
+    for name in ("f1_4_rooms_1", "read_rate", "reconstruction_mse"):
+        (event,) = events.Scalars(f"eval/{name}")
+        assert event.step == 12 and event.value == np.float32(measures[name]), name
+
+
 def test_small_run_leaves_its_records(small_run):
     segmentation = json.loads((small_run / "segmentation.json").read_text())
     assert {"prior", "sampled", "posterior", "floors", "episodes"} <= set(segmentation)
