@@ -21,7 +21,7 @@ run: $(VENV)/ready
 	@echo "learning curve: $(RUN_DIR)/learning_curve.png, evaluation: $(RUN_DIR)/evaluation.json"
 
 test: $(VENV)/ready-test
-	$(VENV)/bin/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile
+	$(VENV)/bin/python -m pytest -m "not slow" --numprocesses 2 --dist loadfile --durations 15
 
 test-slow: $(VENV)/ready-test
 	$(VENV)/bin/python -m pytest -m slow --numprocesses 2 --dist loadfile --durations 20

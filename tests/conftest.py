@@ -9,6 +9,7 @@ import json
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -30,6 +31,7 @@ SMALL = [
     *("--update-epochs", "2", "--checkpoint-interval", "1", "--eval-episodes", "2"),
 ]
 torch.set_num_threads(1)
+NO_SKIPS = "CLEANRL_THESIS_NO_SKIPS" in os.environ  # .ci/run has installed Slurm and Chromium: they have to work
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 
 
@@ -61,12 +63,22 @@ def run(
 
 @contextlib.contextmanager
 def as_a_process_of_its_own():
-    """Take back what a script leaves to the end of its process: run folders that are locked, denormals that are flushed."""
+    """Take back what a script leaves to the end of its process.
+
+    Run folders that are locked, denormals that are flushed, the number of threads, and what signals do.
+    """
+    threads = torch.get_num_threads()
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)}
     with unittest.mock.patch.object(fcntl, "flock", side_effect=fcntl.flock) as flock:
-        yield
-    for call in flock.call_args_list:
-        os.close(call.args[0])
-    torch.set_flush_denormal(False)
+        try:
+            yield
+        finally:
+            for call in flock.call_args_list:
+                os.close(call.args[0])
+            torch.set_flush_denormal(False)
+            torch.set_num_threads(threads)
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
 
 def ends_before_it_is_killed(process: subprocess.Popen, seconds: float) -> bool:
@@ -84,14 +96,21 @@ def modified(path: Path) -> int:
     return path.stat().st_mtime_ns if path.exists() else 0
 
 
-def kill_twice(flags: list, seconds: float, seed: int, script: Path = SCRIPT, after_checkpoints: bool = False) -> None:
+def kill_twice(
+    flags: list,
+    seconds: float,
+    seed: int,
+    script: Path = SCRIPT,
+    after_checkpoints: bool = False,
+    share: float | None = None,
+) -> None:
     """Start a run that takes about `seconds`, kill it, resume it, and kill it again, both at random moments.
 
-    With `after_checkpoints` these are within an interval or so of its next checkpoint, but for the first kill of an odd seed,
-    which comes before anything is saved.
+    With `after_checkpoints` these are within an interval or so of its next checkpoint (or within a given share of the
+    seconds), but for the first kill of an odd seed, which comes before anything is saved.
     """
     rng, folder, kills = random.Random(seed), Path(flags[flags.index("--run-dir") + 1]), 0
-    path, longest = folder / "checkpoint.pt", seconds * (0.1 if after_checkpoints else 0.8)
+    path, longest = folder / "checkpoint.pt", seconds * (share or (0.1 if after_checkpoints else 0.8))
     while kills < 2:
         early, before = after_checkpoints and kills == 0 and seed % 2 == 1, modified(path)
         line = command(*flags, "--resume", script=script)

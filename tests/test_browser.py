@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import websockets.exceptions
 import websockets.sync.client
-from conftest import ROOT, command
+from conftest import NO_SKIPS, ROOT, command
 from playwright.async_api import Error, async_playwright
 from playwright.sync_api import sync_playwright
 
@@ -26,7 +26,7 @@ from cleanrl_thesis import sensitivity_test as study
 CHROMIUM = shutil.which("chromium")
 RECORD, STUDY = (ROOT / "cleanrl_thesis" / f"{name}.py" for name in ("record_human", "sensitivity_test"))
 LAUNCH = {"executable_path": CHROMIUM, "args": ["--no-sandbox"]}
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None and not NO_SKIPS, reason="needs chromium")]
 
 
 def start(script: Path, *flags: object) -> tuple[subprocess.Popen, str]:

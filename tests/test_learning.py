@@ -22,7 +22,7 @@ def test_inverted_pendulum_stands(tmp_path):
     assert evaluation(tmp_path, "--env-id", "kle/InvertedPendulum-v2", "--total-timesteps", 100_000) > 900
 
 
-@pytest.mark.parametrize("mode", [[], ["--kle-stop"], ["--kle-rollback"]], ids=["ppo", "kle-stop", "kle-rollback"])
+@pytest.mark.parametrize("mode", [[], ["--kle-rollback"]], ids=["ppo", "kle-rollback"])
 def test_hopper_hops(tmp_path, mode):
     """A policy that falls at once gets about 20, one that stands still 1,000."""
     assert evaluation(tmp_path, "--env-id", "kle/Hopper-v2", "--total-timesteps", 500_000, *mode) > 1500
