@@ -124,89 +124,89 @@ class Args:
 
     # Algorithm
     env_id: Literal["FourRooms11-v0", "FourRooms19-v0"] = "FourRooms11-v0"
-    """the maze of 11 × 11 or of 19 × 19 cells"""
+    """the maze of 11 × 11 cells (the author's code) or of 19 × 19 (MiniGrid)"""
     size: Literal["xs", "s", "m", "thesis"] = "xs"
-    """what the flags below whose default is None stand for (`SIZES`)"""
+    """what the flags below whose default is None stand for (`SIZES`); sources are those of `thesis`, the other values are ours"""
     total_timesteps: int = 2_000_000
-    """environment steps"""
+    """environment steps (section 3.4)"""
     num_envs: int = 10
-    """games side by side"""
+    """games side by side (ours)"""
     prefill: int | None = None
-    """first environment steps, of random play, without updates"""
+    """first environment steps, of random play, without updates (DreamerV2)"""
     train_frequency: int = 5
-    """environment steps per update"""
+    """environment steps per update (section 3.4: 400,000 updates)"""
     batch_size: int | None = None
-    """chunks per batch"""
+    """chunks per batch (DreamerV2)"""
     chunk_length: int | None = None
-    """steps of a chunk; episodes follow each other in it"""
+    """steps of a chunk; episodes follow each other in it (DreamerV2)"""
     rewarded_share: float | None = None
     """share of the chunks that hold a reward, where there is one, and above 0 one chunk at least; all others are drawn from
-    anywhere"""
+    anywhere (ours)"""
     starts: int | None = None
-    """states of a batch at which dreams start, at most"""
+    """states of a batch at which dreams start, at most (DreamerV2: all)"""
     horizon: int = 15
-    """steps of a dream"""
+    """steps of a dream (DreamerV2)"""
     gamma: float | None = None
-    """discount factor γ"""
+    """discount factor γ (DreamerV2)"""
     gae_lambda: float = 0.95
-    """λ of the returns"""
+    """λ of the returns (DreamerV2)"""
 
     # World model
     encoder: Literal["tiles", "cnn"] | None = None
-    """a linear map of 2 × 2 pixels each, or convolutions over 64 × 64"""
+    """a linear map of 2 × 2 pixels each (ours), or convolutions over 64 × 64 (DreamerV2)"""
     frame_side: int | None = None
-    """pixels of the frames' side; default: 64 for a CNN, two for each cell for tiles"""
+    """pixels of the frames' side; default: 64 for a CNN (DreamerV2), two for each cell for tiles (ours)"""
     depth: int | None = None
-    """features of a tile, or channels of the first convolution"""
+    """features of a tile, or channels of the first convolution (DreamerV2)"""
     deter: int | None = None
-    """units of the recurrent state"""
+    """units of the recurrent state (DreamerV2; with the codes 1,624 numbers, as the Q&A says)"""
     stoch: int | None = None
-    """categorical variables of the stochastic state"""
+    """categorical variables of the stochastic state (DreamerV2)"""
     classes: int | None = None
-    """classes of each"""
+    """classes of each (DreamerV2)"""
     hidden_size: int | None = None
-    """units of hidden layers in the model"""
+    """units of hidden layers in the model (DreamerV2)"""
     head_size: int | None = None
-    """units of hidden layers in reward, discount, actor and critic"""
+    """units of hidden layers in reward, discount, actor and critic (DreamerV2)"""
     head_layers: int | None = None
-    """hidden layers in these"""
+    """hidden layers in these (DreamerV2)"""
     head_norm: bool | None = None
-    """layer normalisation in these"""
+    """layer normalisation in these (ours)"""
     image_scale: float | None = None
-    """weight of the reconstruction"""
+    """weight of the reconstruction (DreamerV2: 1)"""
     kl_scale: float | None = None
-    """weight of the KL divergence"""
+    """weight of the KL divergence (DreamerV2)"""
     entropy_scale: float | None = None
     """weight of the entropy of the codes at first, to none over `--kl-warmup`; without it the goal, which is learned first, takes
-    all codes, sharp ones that learn little more, and some seeds do not see the agent for hundreds of updates"""
+    all codes, sharp ones that learn little more, and some seeds do not see the agent for hundreds of updates (ours)"""
     kl_warmup: int | None = None
-    """updates over which the weight of the KL divergence grows from a tenth"""
+    """updates over which the weight of the KL divergence grows from a tenth (ours)"""
     kl_balance: float = 0.8
-    """share of its gradient that trains the prior, the rest trains the posterior"""
+    """share of its gradient that trains the prior, the rest trains the posterior (DreamerV2)"""
     reward_scale: float | None = None
-    """weight of the reward's loss"""
+    """weight of the reward's loss (DreamerV2: 1)"""
     discount_scale: float = 5.0
-    """weight of the loss of the end of an episode"""
+    """weight of the loss of the end of an episode (DreamerV2)"""
     tanh_reward: bool | None = None
-    """learn tanh(reward)"""
+    """learn tanh(reward) (DreamerV2)"""
     model_learning_rate: float | None = None
-    """Adam's learning rate for the world model"""
+    """Adam's learning rate for the world model (DreamerV2)"""
 
     # Behaviour
     actor_learning_rate: float | None = None
-    """Adam's learning rate for the actor"""
+    """Adam's learning rate for the actor (DreamerV2)"""
     critic_learning_rate: float | None = None
-    """Adam's learning rate for the critic"""
+    """Adam's learning rate for the critic (DreamerV2)"""
     adam_eps: float | None = None
-    """Adam's ε for actor and critic; 1e-5 for the world model"""
+    """Adam's ε for actor and critic; 1e-5 for the world model (DreamerV2)"""
     ent_coef: float | None = None
-    """weight of the actor's entropy η"""
+    """weight of the actor's entropy η (Eq. 3.3.9; DreamerV2)"""
     slow_interval: int = 100
-    """updates between copies of the critic to the slow critic"""
+    """updates between copies of the critic to the slow critic (DreamerV2)"""
     weight_decay: float = 1e-6
-    """share of each weight that an update takes away"""
+    """share of each weight that an update takes away (DreamerV2)"""
     max_grad_norm: float = 100.0
-    """bound on the norm of each gradient; inf for none"""
+    """bound on the norm of each gradient; inf for none (DreamerV2)"""
 
 
 SIZES = {  # what a flag that is not given stands for, by --size

@@ -116,62 +116,62 @@ class Args:
 
     # Algorithm
     env_id: Literal["FourRooms11-v0", "FourRooms19-v0"] = "FourRooms11-v0"
-    """the maze of 11 × 11 or of 19 × 19 cells"""
+    """the maze of 11 × 11 cells (the author's code) or of 19 × 19 (MiniGrid)"""
     size: Literal["xs", "s", "m", "thesis"] = "xs"
-    """what the flags below whose default is None stand for (`SIZES`)"""
+    """what the flags below whose default is None stand for (`SIZES`); sources are those of `thesis`, the other values are ours"""
     total_timesteps: int = 2_000_000
-    """environment steps"""
+    """environment steps (section 3.4)"""
     num_envs: int = 10
-    """games side by side"""
+    """games side by side (ours)"""
     prefill: int | None = None
-    """first environment steps, of random play, without updates"""
+    """first environment steps, of random play, without updates (DreamerV2)"""
     train_frequency: int = 5
-    """environment steps per update"""
+    """environment steps per update (section 3.4: 400,000 updates)"""
     batch_size: int | None = None
-    """chunks per batch"""
+    """chunks per batch (DreamerV2)"""
     chunk_length: int | None = None
-    """steps of a chunk; episodes follow each other in it"""
+    """steps of a chunk; episodes follow each other in it (DreamerV2)"""
     rewarded_share: float | None = None
     """share of the chunks that hold a reward, where there is one, and above 0 one chunk at least; all others are drawn from
-    anywhere"""
+    anywhere (ours)"""
     starts: int | None = None
-    """states of a batch at which dreams start, at most"""
+    """states of a batch at which dreams start, at most (DreamerV2: all)"""
     horizon: int = 15
-    """steps of a dream"""
+    """steps of a dream (H of Eq. 3.3.14 to 3.3.17; DreamerV2)"""
     gamma: float | None = None
-    """discount factor γ"""
+    """discount factor γ (DreamerV2)"""
     gae_lambda: float = 0.95
-    """λ of the returns"""
+    """λ of the returns (Eq. 3.3.14, 3.3.16; DreamerV2)"""
 
     # World model
     encoder: Literal["tiles", "cnn"] | None = None
-    """a linear map of 2 × 2 pixels each, or convolutions over 64 × 64"""
+    """a linear map of 2 × 2 pixels each (ours), or convolutions over 64 × 64 (DreamerV2)"""
     frame_side: int | None = None
-    """pixels of the frames' side; default: 64 for a CNN, two for each cell for tiles"""
+    """pixels of the frames' side; default: 64 for a CNN (DreamerV2), two for each cell for tiles (ours)"""
     depth: int | None = None
-    """features of a tile, or channels of the first convolution"""
+    """features of a tile, or channels of the first convolution (DreamerV2)"""
     deter_z: int | None = None
-    """size of c_t"""
+    """size of c_t (ours; with v_t 812 numbers, as the Q&A says)"""
     stoch_z: int | None = None
-    """variables of v"""
+    """variables of v (ours)"""
     deter_w: int | None = None
-    """size of h_t"""
+    """size of h_t (ours; with y_t 812 numbers, as the Q&A says)"""
     stoch_w: int | None = None
-    """variables of y"""
+    """variables of y (ours)"""
     classes: int | None = None
-    """classes of each, categorical as in the baseline; 1: normal variables, as the thesis has them"""
+    """classes of each, categorical as in the baseline (ours); 1: normal variables (the thesis)"""
     hidden_size: int | None = None
-    """units of hidden layers in the model"""
+    """units of hidden layers in the model (DreamerV2)"""
     head_size: int | None = None
-    """units of hidden layers in reward, discount, actor and critic"""
+    """units of hidden layers in reward, discount, actor and critic (DreamerV2)"""
     head_layers: int | None = None
-    """hidden layers in these"""
+    """hidden layers in these (DreamerV2)"""
     head_norm: bool | None = None
-    """layer normalisation in these"""
+    """layer normalisation in these (ours)"""
     image_scale: float | None = None
-    """weight of the reconstruction"""
+    """weight of the reconstruction (Eq. 3.3.5, DreamerV2: 1)"""
     std_bias: float = -4.0
-    """with normal variables: added to the standard deviations' outputs at first, so that they start small"""
+    """with normal variables: added to the standard deviations' outputs at first, so that they start small (ours)"""
     kl_z_scale: float | None = None
     """weight of KL[q(z) ‖ p(z)] (Eq. 3.3.5: 1)"""
     kl_w_scale: float | None = None
@@ -180,19 +180,19 @@ class Args:
     """weight of KL[q(m) ‖ p(m)] (Eq. 3.3.5: 1)"""
     entropy_scale: float | None = None
     """weight of the entropy of categorical codes at first, to none over `--kl-warmup`; without it the goal, which is learned first, takes
-    all codes, sharp ones that learn little more, and some seeds do not see the agent for hundreds of updates"""
+    all codes, sharp ones that learn little more, and some seeds do not see the agent for hundreds of updates (ours)"""
     kl_warmup: int | None = None
-    """updates over which the weights of KL_z and KL_w grow from a tenth"""
+    """updates over which the weights of KL_z and KL_w grow from a tenth (ours)"""
     kl_balance: float = 0.8
     """share of each KL term's gradient that trains p, the rest trains q (DreamerV2)"""
     detach_kl_z: bool = True
-    """KL_z counts at the reads, and does not price them (VTA); off: Eq. 3.3.7"""
+    """KL_z counts at the reads, and does not price them (VTA); off: it does (Eq. 3.3.7)"""
     temperature: float = 0.3
-    """last temperature of the binary Gumbel samples of m; from 1 over `--budget-updates`"""
+    """last temperature of the binary Gumbel samples of m; from 1 over `--budget-updates` (ours)"""
     boundary_bound: float = 6.0
-    """bound on the logits of q(m); 0 for none"""
+    """bound on the logits of q(m); 0 for none (ours)"""
     read_bias: float = 2.0
-    """logit of q(m) at first: start with many reads"""
+    """logit of q(m) at first: start with many reads (ours)"""
     w_reset: bool = False
     """w starts anew from z where z is read (VTA)"""
     c_sees_w: bool = True
@@ -202,39 +202,39 @@ class Args:
     decoder_sees_c: bool = True
     """the decoder sees c_t too (Eq. 3.3.1), not only v_t: c_t knows of frames a step late"""
     budget: float = 0.23
-    """share of steps read without a price, from 1 over `--budget-updates`, by q(m) and not counting those after a first read"""
+    """share of steps read without a price, from 1 over `--budget-updates`, by q(m) and not counting those after a first read (ours)"""
     budget_price: float = 10.0
-    """price of the reads beyond it, on the mean read rate; 0: no budget"""
+    """price of the reads beyond it, on the mean read rate; 0: no budget (ours)"""
     budget_updates: int = 5_000
-    """updates over which budget and temperature come to their last values"""
+    """updates over which budget and temperature come to their last values (ours)"""
     fixed_interval: int = 0
     """a segment begins every so many steps instead (Eq. 3.2.2, 3.3.16); 0: where the model says"""
     reward_scale: float | None = None
-    """weight of the reward's loss"""
+    """weight of the reward's loss (Eq. 3.3.11, DreamerV2: 1)"""
     discount_scale: float = 5.0
-    """weight of the loss of the end of an episode"""
+    """weight of the loss of the end of an episode (DreamerV2)"""
     tanh_reward: bool | None = None
-    """learn tanh(reward)"""
+    """learn tanh(reward) (DreamerV2)"""
     model_learning_rate: float | None = None
-    """Adam's learning rate for the world model"""
+    """Adam's learning rate for the world model (DreamerV2)"""
 
     # Behaviour
     num_skills: int = 8
-    """skills that the high-level policy chooses from"""
+    """skills that the high-level policy chooses from (section 3.3.4: eight rooms)"""
     actor_learning_rate: float | None = None
-    """Adam's learning rate for both actors"""
+    """Adam's learning rate for both actors (DreamerV2)"""
     critic_learning_rate: float | None = None
-    """Adam's learning rate for both critics"""
+    """Adam's learning rate for both critics (DreamerV2)"""
     adam_eps: float | None = None
-    """Adam's ε for actors and critics; 1e-5 for the world model"""
+    """Adam's ε for actors and critics; 1e-5 for the world model (DreamerV2)"""
     ent_coef: float | None = None
-    """weight η of the entropy of both policies"""
+    """weight η of the entropy of both policies (Eq. 3.3.15, 3.3.17; DreamerV2)"""
     slow_interval: int = 100
-    """updates between copies of the critics to the slow critics"""
+    """updates between copies of the critics to the slow critics (DreamerV2)"""
     weight_decay: float = 1e-6
-    """share of each weight that an update takes away"""
+    """share of each weight that an update takes away (DreamerV2)"""
     max_grad_norm: float = 100.0
-    """bound on the norm of each gradient; inf for none"""
+    """bound on the norm of each gradient; inf for none (DreamerV2)"""
 
 
 SIZES = {  # what a flag that is not given stands for, by --size; features are as many as the baseline's

@@ -109,47 +109,47 @@ class Args:
 
     # Data
     demos: Path | None = None
-    """folder of demonstrations with `states` and `rooms`, as `ppo_fourrooms.py --save-demos` writes it"""
+    """folder of demonstrations with `states` and `rooms`, as `ppo_fourrooms.py --save-demos` writes it (section 3.4)"""
     train_pairs: int = 25_000
     """observation-action pairs to train on (section 3.4); the episodes after them are held out"""
     heldout_episodes: int = 400
-    """episodes held out, at most"""
+    """episodes held out, at most (ours)"""
     heldout_demos: Path | None = None
     """folder whose episodes are held out, where those to train on are of another player: those after its first `--train-pairs`
-    pairs, from which the probes learn; default: the rest of `--demos`"""
+    pairs, from which the probes learn; default: the rest of `--demos` (ours)"""
     frame_side: int = 22
-    """pixels of the frames' side, to which the recorded ones are shrunk; two for each cell of the 11 × 11 maze"""
+    """pixels of the frames' side, to which the recorded ones are shrunk; two for each cell of the 11 × 11 maze (ours)"""
     red_scale: float = 5.0
-    """factor on the red channel: the agent is small, and would be found late"""
+    """factor on the red channel: the agent is small, and would be found late (ours)"""
 
     # Algorithm
     attempts: int = 1
     """models trained one after the other, each from weights of its own: that with the greatest J_HWM (`objective`) is kept, and the
-    boundaries on which most of them agree are measured too"""
+    boundaries on which most of them agree are measured too (ours)"""
     total_updates: int = 4_000
-    """gradient steps of an attempt"""
+    """gradient steps of an attempt (ours)"""
     batch_size: int = 16
-    """chunks per batch"""
+    """chunks per batch (ours)"""
     chunk_length: int = 32
-    """steps of a chunk; episodes follow each other in it"""
+    """steps of a chunk; episodes follow each other in it (ours)"""
     learning_rate: float = 3e-3
-    """Adam's learning rate; after a warm-up of 100 updates, and three tenths of it in the last three tenths"""
+    """Adam's learning rate; after a warm-up of 100 updates, and three tenths of it in the last three tenths (ours)"""
     max_grad_norm: float = 100.0
-    """bound on the norm of the gradient; inf for none"""
+    """bound on the norm of the gradient; inf for none (DreamerV2)"""
     deter_z: int = 64
-    """size of c_t (the agents' `--size thesis`: 300)"""
+    """size of c_t (ours; the agents' `--size thesis`: 300)"""
     stoch_z: int = 32
-    """size of v_t (there 512)"""
+    """size of v_t (ours; there 512)"""
     deter_w: int = 64
-    """size of h_t (there 300)"""
+    """size of h_t (ours; there 300)"""
     stoch_w: int = 4
-    """size of y_t (there 512)"""
+    """size of y_t (ours; there 512)"""
     hidden_size: int = 128
-    """units of hidden layers"""
+    """units of hidden layers (ours)"""
     std_bias: float = -4.0
-    """added to the standard deviations' outputs at first, so that they start small"""
+    """added to the standard deviations' outputs at first, so that they start small (ours)"""
     image_scale: float | None = None
-    """weight of the reconstruction; default: (64 / frame_side)², as if the frames had 64 pixels"""
+    """weight of the reconstruction; default: (64 / frame_side)², as if the frames had 64 pixels (ours; Eq. 3.3.5: 1)"""
     kl_z_scale: float = 0.1
     """weight of KL[q(z) ‖ p(z)] (Eq. 3.3.5: 1; as the baseline's)"""
     kl_w_scale: float = 0.1
@@ -161,11 +161,11 @@ class Args:
     detach_kl_z: bool = True
     """KL_z weighs the reads, and does not price them (VTA); off: Eq. 3.3.7"""
     temperature: float = 0.3
-    """last temperature of the binary Gumbel samples of m; from 1 over `--budget-updates`"""
+    """last temperature of the binary Gumbel samples of m; from 1 over `--budget-updates` (ours)"""
     boundary_bound: float = 4.0
-    """bound on the logits of q(m); 0 for none"""
+    """bound on the logits of q(m); 0 for none (ours)"""
     read_bias: float = 2.0
-    """logit of q(m) at first: start with many reads"""
+    """logit of q(m) at first: start with many reads (ours)"""
     max_segment_length: int = 20
     """in training, a read is forced after as many steps without; 0 for never (VTA)"""
     max_segments: int = 0
@@ -173,9 +173,9 @@ class Args:
     w_reset: bool = True
     """w starts anew from z where z is read (VTA; the thesis: no)"""
     narrow_w: bool = True
-    """means of y in ±1 and a fixed noise in q(y), so that it carries few bits"""
+    """means of y in ±1 and a fixed noise in q(y), so that it carries few bits (ours)"""
     narrow_std: float = 0.4
-    """that noise"""
+    """that noise's standard deviation (ours)"""
     c_sees_w: bool = True
     """c_t is made from w_{t-1} and a_{t-1} too (Eq. 3.3.1), not only from z_{t-1} (VTA)"""
     decoder_sees_h: bool = False
@@ -183,20 +183,20 @@ class Args:
     decoder_sees_c: bool = False
     """the decoder sees c_t too (Eq. 3.3.1), not only v_t: c_t knows of frames a step late"""
     read_price: float = 0.0
-    """price of a read, on the mean read rate"""
+    """price of a read, on the mean read rate (ours)"""
     budget: float = 0.15
-    """share of steps read without a price, from 1 over `--budget-updates`"""
+    """share of steps read without a price, from 1 over `--budget-updates` (ours)"""
     budget_price: float = 50.0
-    """price of the reads beyond it, on the mean read rate; 0: no budget"""
+    """price of the reads beyond it, on the mean read rate; 0: no budget (ours)"""
     budget_updates: int | None = None
-    """updates of an attempt over which budget and temperature come to their last values; default: 80% of them"""
+    """updates of an attempt over which budget and temperature come to their last values; default: 80% of them (ours)"""
     surprise_price: float = 0.0
     """price of a nat by which KL_z of a read is above their mean, from 0 over `--surprise-updates` after the budget, which is then
-    one from both sides: z is rather read where it is foretold; 0 for none"""
+    one from both sides: z is rather read where it is foretold; 0 for none (ours)"""
     surprise_updates: int = 500
-    """updates over which that price grows"""
+    """updates over which that price grows (ours)"""
     foretell_copies: float = 0.0
-    """weight of KL_z at steps that copy, q(z) held: p(z) learns how surprising a read there would be"""
+    """weight of KL_z at steps that copy, q(z) held: p(z) learns how surprising a read there would be (ours)"""
 
     # to be filled in runtime
     env_id: tyro.conf.Suppress[str] = ""
