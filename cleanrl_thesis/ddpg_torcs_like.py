@@ -13,10 +13,10 @@ after every crash: on the same machine the run ends with the same bytes.
 | steps, replay buffer | 10,000,000; 1,000,000 | section 2.4.3 |
 | learning rate of actor and critic | 1e-4, 1e-3 | OpenAI Baselines' defaults; section 2.4.3 names them the other way round |
 | both annealed to 0 | on | ours; Baselines' are constant |
-| policy that is kept | the one with the highest mean minus standard deviation of the returns in 200 episodes of its own, played every 200,000 steps | ours; Baselines' is the last |
+| policy that is kept | the one with the highest mean minus standard deviation of its returns in 200 episodes, which are played every 200,000 steps and serve nothing else | ours; Baselines' is the last |
 | γ, τ, batch, L2 of the critic, layer norm | 0.99, 0.01, 64, 1e-2, on | OpenAI Baselines' defaults |
 | observations | normalised by running statistics, clipped to 5 standard deviations, each taken as at least 0.1 | OpenAI Baselines' defaults |
-| updates | 50 after every 100 steps | OpenAI Baselines' defaults; an action is held for 5 steps here, so that 20 actions are followed by 50 updates, there 100 |
+| updates | 50 after every 100 steps | OpenAI Baselines' defaults; there 100 steps are 100 actions, here 20, for each is held for 5 steps |
 | noise | on the parameters, adapted to an action distance of 0.2 | OpenAI Baselines' defaults |
 | network | 64-64 with ReLU, the action enters the critic's second layer | OpenAI Baselines' defaults |
 | an action | held for 5 steps, 0.1 s; the reward is scaled by 0.1 | ours; Baselines has 1 and 1 |
@@ -153,7 +153,7 @@ class Args:
     layer_norm: bool = True
     """normalise the hidden layers (Baselines)"""
     normalize_obs: bool = True
-    """bring observations to mean 0 and standard deviation 1 by running statistics, clipped to 5 deviations (Baselines)"""
+    """bring observations to mean 0 and standard deviation 1 by running statistics, clipped to ±5 (Baselines)"""
     buffer_size: int = 1_000_000
     """transitions in the replay buffer, 536 bytes each with TorcsLike-v0 (section 2.4.3)"""
     gamma: float = 0.99

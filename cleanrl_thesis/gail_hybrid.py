@@ -839,10 +839,10 @@ class SyntheticDriver:
     a point ahead of where the car will be by then, a little too much or too little, and corrects with the next look; it
     slows down before curves and parked cars once they are in sight. Its numbers are guesses but for the boldness, with
     which its mean on the road `meadow` is 475 (km/h) s, without a crash in 220 episodes: 0.78 of the DDPG expert's, as in
-    Table 2.3. Its deviation is 12, there 31. On `speedway` and `city` it crashes in some episodes.
+    Table 2.3. Its standard deviation is 12, there 31. On `speedway` and `city` it crashes in some episodes.
     """
 
-    look, look_spread = 7.0, 0.3  # median time between looks in steps of 0.02 s, and its deviation as a share
+    look, look_spread = 7.0, 0.3  # median time between looks in steps of 0.02 s, and its standard deviation as a share
     reaction = 8  # steps from a look to the hands
     sight = 120.0  # m of road that it heeds
     comfort = 7.0  # m/s² to the side in curves
@@ -1362,7 +1362,7 @@ class Batch(NamedTuple):
     obs: torch.Tensor  # (B, O), normalised
     actions: torch.Tensor  # (B, A), as sampled
     seen: torch.Tensor  # (B, A), as the environment and so the discriminator had them, within bounds
-    advantages: torch.Tensor  # (B,), mean 0 and deviation 1
+    advantages: torch.Tensor  # (B,), mean 0 and standard deviation 1
     returns: torch.Tensor  # (B,)
 
 
