@@ -683,163 +683,8 @@ def hwm_loss(
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# How good a segmentation is
+# Learning
 # ---------------------------------------------------------------------------------------------------------------------
-# A segmentation of an episode with T steps is a bool array (T - 1,): whether a new segment begins with step t + 1.
-def merge_doors(rooms: np.ndarray) -> np.ndarray:
-    """Room labels (T,) in which a door belongs to the room that is being left: 4 labels, one boundary a crossing."""
-    merged = rooms.copy()
-    for t in range(1, len(rooms)):
-        if merged[t] >= 4:
-            merged[t] = merged[t - 1]
-    return merged
-
-
-def matches(found: np.ndarray, true: np.ndarray, before: int, after: int) -> int:
-    """The largest number of pairs of boundaries, each used once, the found one at most `before` steps early or `after` late."""
-    found, true = np.flatnonzero(found).tolist(), np.flatnonzero(true).tolist()
-    count = i = j = 0
-    while i < len(found) and j < len(true):
-        if -before <= found[i] - true[j] <= after:
-            count, i, j = count + 1, i + 1, j + 1
-        elif found[i] < true[j]:
-            i += 1
-        else:
-            j += 1
-    return count
-
-
-def f1_score(found: list[np.ndarray], true: list[np.ndarray], before: int, after: int) -> dict[str, float]:
-    """Precision, recall and F1 of boundaries, over all episodes together."""
-    hits = sum(matches(a, b, before, after) for a, b in zip(found, true))
-    claimed, real = (sum(int(part.sum()) for part in parts) for parts in (found, true))
-    precision, recall = hits / max(claimed, 1), hits / max(real, 1)
-    return {"precision": precision, "recall": recall, "f1": 2 * hits / max(claimed + real, 1)}
-
-
-AGREEMENT_KERNEL = np.array([1, 2, 3, 2, 1])  # what a model's vote for a boundary counts for the steps around it
-
-
-def agree(votes: np.ndarray) -> np.ndarray:
-    """Boundaries (T − 1,) of N models' (N, T − 1): where the votes weigh more than those of half of the models at one step.
-
-    The greatest sums come first, no two within the kernel's reach. Each model reads once around a door, but at steps that differ;
-    so do viewers who press a button at a cut. Every read votes, so several of one model around a step weigh more than one.
-    """
-    reach, steps = len(AGREEMENT_KERNEL) // 2, votes.shape[1]
-    agreed = np.zeros(steps, bool)
-    if steps == 0:
-        return agreed
-    sums = np.convolve(votes.sum(0), AGREEMENT_KERNEL)[reach : reach + steps]
-    while 2 * sums.max() > AGREEMENT_KERNEL.max() * len(votes):
-        t = int(sums.argmax())
-        agreed[t] = True
-        sums[max(0, t - reach) : t + reach + 1] = -1
-    return agreed
-
-
-def near(boundaries: np.ndarray) -> np.ndarray:
-    """Which steps are at most one from a boundary, (T - 1,)."""
-    padded = np.pad(boundaries, 1)
-    return padded[:-2] | padded[1:-1] | padded[2:]
-
-
-def boundary_scores(found: list[np.ndarray], rooms: list[np.ndarray]) -> dict[str, float]:
-    """All measures of boundaries for episodes with room labels (T,) each.
-
-    `_0` is exact, `_1` within a step; `4_rooms_either` takes the last step in the door or the first behind it, for the door can
-    be of either room.
-    """
-    scores = {"read_rate": float(np.concatenate(found).mean())}
-    scores["segment_length"] = sum(map(len, rooms)) / (sum(int(part.sum()) for part in found) + len(rooms))
-    for name, labels in (("8_labels", rooms), ("4_rooms", [merge_doors(each) for each in rooms])):
-        true = [each[1:] != each[:-1] for each in labels]
-        for tolerance in (0, 1):
-            score = f1_score(found, true, tolerance, tolerance)
-            scores |= {f"{key}_{name}_{tolerance}": value for key, value in score.items()}
-    scores |= {f"{key}_4_rooms_either": value for key, value in f1_score(found, true, 1, 0).items()}
-    entries = [(each[:-1] < 4) & (each[1:] >= 4) for each in rooms]
-    scores["door_entry_recall"] = f1_score(found, entries, 1, 1)["recall"]
-    inside = np.concatenate([part[~near(each[1:] != each[:-1])] for part, each in zip(found, rooms)])
-    scores["read_rate_inside_rooms"] = float(inside.mean()) if len(inside) else math.nan
-    return scores
-
-
-def floors(rooms: list[np.ndarray], states: list[np.ndarray], read_rate: float, rng: np.random.Generator) -> dict:
-    """The same measures of segmentations that know nothing of rooms, and of one that reads at each door."""
-    moves = [each[1:, 0] != each[:-1, 0] for each in states]
-    base_rate = float(np.concatenate([each[1:] != each[:-1] for each in rooms]).mean())
-    move_rate = read_rate * sum(map(len, moves)) / max(1, sum(int(part.sum()) for part in moves))
-
-    def every(k: int) -> list[np.ndarray]:
-        return [np.isin(np.arange(len(part)), np.flatnonzero(part)[k - 1 :: k]) for part in moves]
-
-    made = {
-        "always": [np.ones(len(part), bool) for part in moves],
-        "never": [np.zeros(len(part), bool) for part in moves],
-    }
-    made["coin at the truth's rate"] = [rng.random(len(part)) < base_rate for part in moves]
-    made["coin at the model's rate, on moves"] = [part & (rng.random(len(part)) < move_rate) for part in moves]
-    made |= {f"every {k} steps": [np.arange(1, len(part) + 1) % k == 0 for part in moves] for k in range(2, 8)}
-    made |= {f"every {k} moves" if k > 1 else "every move": every(k) for k in (1, 2, 3)}
-    made["at each door"] = [(each[:-1] < 4) & (each[1:] >= 4) for each in rooms]
-    return {name: boundary_scores(found, rooms) for name, found in made.items()}
-
-
-def area_under_curve(scores: np.ndarray, true: np.ndarray) -> float:
-    """Probability that a boundary has a higher score than another step; ties count half."""
-    _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
-    ranks = (np.cumsum(counts) - (counts - 1) / 2)[inverse]
-    positives = int(true.sum())
-    if positives in (0, len(true)):
-        return math.nan
-    return float((ranks[true].sum() - positives * (positives + 1) / 2) / (positives * (len(true) - positives)))
-
-
-def linear_probe(train: tuple[np.ndarray, np.ndarray], test: tuple[np.ndarray, np.ndarray]) -> float:
-    """Accuracy on `test` of a ridge regression from features (N, D) onto one-hot labels (N,), fitted on `train`."""
-    (x, labels), (test_x, test_labels) = train, test
-    mean, std = x.mean(0), x.std(0) + 1e-4
-
-    def design(features: np.ndarray) -> np.ndarray:
-        return np.concatenate([(features - mean) / std, np.ones((len(features), 1))], 1).astype(np.float64)
-
-    a, classes = design(x), int(max(labels.max(), test_labels.max())) + 1
-    weights = np.linalg.solve(a.T @ a + 1e-3 * len(a) * np.eye(a.shape[1]), a.T @ np.eye(classes)[labels])
-    return float(((design(test_x) @ weights).argmax(1) == test_labels).mean())
-
-
-def k_means(x: np.ndarray, clusters: int, rng: np.random.Generator, rounds: int = 50) -> np.ndarray:
-    """Labels (N,) of points (N, D) by Lloyd's algorithm, from distant first centres (k-means++)."""
-    centres = x[rng.integers(len(x), size=1)]
-    while len(centres) < clusters:
-        nearest = ((x[:, None] - centres) ** 2).sum(-1).min(1)
-        share = nearest / nearest.sum() if nearest.sum() > 0 else np.full(len(x), 1 / len(x))
-        centres = np.concatenate([centres, x[rng.choice(len(x), size=1, p=share)]])
-    for _ in range(rounds):
-        labels = ((x[:, None] - centres) ** 2).sum(-1).argmin(1)
-        centres = np.stack([x[labels == k].mean(0) if (labels == k).any() else centres[k] for k in range(clusters)])
-    return labels
-
-
-def normalised_mutual_information(a: np.ndarray, b: np.ndarray) -> float:
-    """Of two labellings (N,): 2 I / (H_a + H_b), 0 where one of them says nothing."""
-    joint = np.zeros((a.max() + 1, b.max() + 1))
-    np.add.at(joint, (a, b), 1 / len(a))
-
-    def entropy(p: np.ndarray) -> float:
-        return float(-(p[p > 0] * np.log(p[p > 0])).sum())
-
-    parts = entropy(joint.sum(1)), entropy(joint.sum(0))
-    return 2 * (sum(parts) - entropy(joint.ravel())) / sum(parts) if sum(parts) > 0 else 0.0
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Training
-# ---------------------------------------------------------------------------------------------------------------------
-LOG_INTERVAL = 50  # updates between rows of updates.csv
-
-
 def schedule(args: Args, update: int) -> tuple[float, float, float, float]:
     """Learning rate, temperature, read budget and price of surprise of an update, counted from 0."""
     update %= args.total_updates
@@ -1080,6 +925,158 @@ class StopSignal:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
+# How good a segmentation is
+# ---------------------------------------------------------------------------------------------------------------------
+# A segmentation of an episode with T steps is a bool array (T - 1,): whether a new segment begins with step t + 1.
+def merge_doors(rooms: np.ndarray) -> np.ndarray:
+    """Room labels (T,) in which a door belongs to the room that is being left: 4 labels, one boundary a crossing."""
+    merged = rooms.copy()
+    for t in range(1, len(rooms)):
+        if merged[t] >= 4:
+            merged[t] = merged[t - 1]
+    return merged
+
+
+def matches(found: np.ndarray, true: np.ndarray, before: int, after: int) -> int:
+    """The largest number of pairs of boundaries, each used once, the found one at most `before` steps early or `after` late."""
+    found, true = np.flatnonzero(found).tolist(), np.flatnonzero(true).tolist()
+    count = i = j = 0
+    while i < len(found) and j < len(true):
+        if -before <= found[i] - true[j] <= after:
+            count, i, j = count + 1, i + 1, j + 1
+        elif found[i] < true[j]:
+            i += 1
+        else:
+            j += 1
+    return count
+
+
+def f1_score(found: list[np.ndarray], true: list[np.ndarray], before: int, after: int) -> dict[str, float]:
+    """Precision, recall and F1 of boundaries, over all episodes together."""
+    hits = sum(matches(a, b, before, after) for a, b in zip(found, true))
+    claimed, real = (sum(int(part.sum()) for part in parts) for parts in (found, true))
+    precision, recall = hits / max(claimed, 1), hits / max(real, 1)
+    return {"precision": precision, "recall": recall, "f1": 2 * hits / max(claimed + real, 1)}
+
+
+AGREEMENT_KERNEL = np.array([1, 2, 3, 2, 1])  # what a model's vote for a boundary counts for the steps around it
+
+
+def agree(votes: np.ndarray) -> np.ndarray:
+    """Boundaries (T − 1,) of N models' (N, T − 1): where the votes weigh more than those of half of the models at one step.
+
+    The greatest sums come first, no two within the kernel's reach. Each model reads once around a door, but at steps that differ;
+    so do viewers who press a button at a cut. Every read votes, so several of one model around a step weigh more than one.
+    """
+    reach, steps = len(AGREEMENT_KERNEL) // 2, votes.shape[1]
+    agreed = np.zeros(steps, bool)
+    if steps == 0:
+        return agreed
+    sums = np.convolve(votes.sum(0), AGREEMENT_KERNEL)[reach : reach + steps]
+    while 2 * sums.max() > AGREEMENT_KERNEL.max() * len(votes):
+        t = int(sums.argmax())
+        agreed[t] = True
+        sums[max(0, t - reach) : t + reach + 1] = -1
+    return agreed
+
+
+def near(boundaries: np.ndarray) -> np.ndarray:
+    """Which steps are at most one from a boundary, (T - 1,)."""
+    padded = np.pad(boundaries, 1)
+    return padded[:-2] | padded[1:-1] | padded[2:]
+
+
+def boundary_scores(found: list[np.ndarray], rooms: list[np.ndarray]) -> dict[str, float]:
+    """All measures of boundaries for episodes with room labels (T,) each.
+
+    `_0` is exact, `_1` within a step; `4_rooms_either` takes the last step in the door or the first behind it, for the door can
+    be of either room.
+    """
+    scores = {"read_rate": float(np.concatenate(found).mean())}
+    scores["segment_length"] = sum(map(len, rooms)) / (sum(int(part.sum()) for part in found) + len(rooms))
+    for name, labels in (("8_labels", rooms), ("4_rooms", [merge_doors(each) for each in rooms])):
+        true = [each[1:] != each[:-1] for each in labels]
+        for tolerance in (0, 1):
+            score = f1_score(found, true, tolerance, tolerance)
+            scores |= {f"{key}_{name}_{tolerance}": value for key, value in score.items()}
+    scores |= {f"{key}_4_rooms_either": value for key, value in f1_score(found, true, 1, 0).items()}
+    entries = [(each[:-1] < 4) & (each[1:] >= 4) for each in rooms]
+    scores["door_entry_recall"] = f1_score(found, entries, 1, 1)["recall"]
+    inside = np.concatenate([part[~near(each[1:] != each[:-1])] for part, each in zip(found, rooms)])
+    scores["read_rate_inside_rooms"] = float(inside.mean()) if len(inside) else math.nan
+    return scores
+
+
+def floors(rooms: list[np.ndarray], states: list[np.ndarray], read_rate: float, rng: np.random.Generator) -> dict:
+    """The same measures of segmentations that know nothing of rooms, and of one that reads at each door."""
+    moves = [each[1:, 0] != each[:-1, 0] for each in states]
+    base_rate = float(np.concatenate([each[1:] != each[:-1] for each in rooms]).mean())
+    move_rate = read_rate * sum(map(len, moves)) / max(1, sum(int(part.sum()) for part in moves))
+
+    def every(k: int) -> list[np.ndarray]:
+        return [np.isin(np.arange(len(part)), np.flatnonzero(part)[k - 1 :: k]) for part in moves]
+
+    made = {
+        "always": [np.ones(len(part), bool) for part in moves],
+        "never": [np.zeros(len(part), bool) for part in moves],
+    }
+    made["coin at the truth's rate"] = [rng.random(len(part)) < base_rate for part in moves]
+    made["coin at the model's rate, on moves"] = [part & (rng.random(len(part)) < move_rate) for part in moves]
+    made |= {f"every {k} steps": [np.arange(1, len(part) + 1) % k == 0 for part in moves] for k in range(2, 8)}
+    made |= {f"every {k} moves" if k > 1 else "every move": every(k) for k in (1, 2, 3)}
+    made["at each door"] = [(each[:-1] < 4) & (each[1:] >= 4) for each in rooms]
+    return {name: boundary_scores(found, rooms) for name, found in made.items()}
+
+
+def area_under_curve(scores: np.ndarray, true: np.ndarray) -> float:
+    """Probability that a boundary has a higher score than another step; ties count half."""
+    _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - (counts - 1) / 2)[inverse]
+    positives = int(true.sum())
+    if positives in (0, len(true)):
+        return math.nan
+    return float((ranks[true].sum() - positives * (positives + 1) / 2) / (positives * (len(true) - positives)))
+
+
+def linear_probe(train: tuple[np.ndarray, np.ndarray], test: tuple[np.ndarray, np.ndarray]) -> float:
+    """Accuracy on `test` of a ridge regression from features (N, D) onto one-hot labels (N,), fitted on `train`."""
+    (x, labels), (test_x, test_labels) = train, test
+    mean, std = x.mean(0), x.std(0) + 1e-4
+
+    def design(features: np.ndarray) -> np.ndarray:
+        return np.concatenate([(features - mean) / std, np.ones((len(features), 1))], 1).astype(np.float64)
+
+    a, classes = design(x), int(max(labels.max(), test_labels.max())) + 1
+    weights = np.linalg.solve(a.T @ a + 1e-3 * len(a) * np.eye(a.shape[1]), a.T @ np.eye(classes)[labels])
+    return float(((design(test_x) @ weights).argmax(1) == test_labels).mean())
+
+
+def k_means(x: np.ndarray, clusters: int, rng: np.random.Generator, rounds: int = 50) -> np.ndarray:
+    """Labels (N,) of points (N, D) by Lloyd's algorithm, from distant first centres (k-means++)."""
+    centres = x[rng.integers(len(x), size=1)]
+    while len(centres) < clusters:
+        nearest = ((x[:, None] - centres) ** 2).sum(-1).min(1)
+        share = nearest / nearest.sum() if nearest.sum() > 0 else np.full(len(x), 1 / len(x))
+        centres = np.concatenate([centres, x[rng.choice(len(x), size=1, p=share)]])
+    for _ in range(rounds):
+        labels = ((x[:, None] - centres) ** 2).sum(-1).argmin(1)
+        centres = np.stack([x[labels == k].mean(0) if (labels == k).any() else centres[k] for k in range(clusters)])
+    return labels
+
+
+def normalised_mutual_information(a: np.ndarray, b: np.ndarray) -> float:
+    """Of two labellings (N,): 2 I / (H_a + H_b), 0 where one of them says nothing."""
+    joint = np.zeros((a.max() + 1, b.max() + 1))
+    np.add.at(joint, (a, b), 1 / len(a))
+
+    def entropy(p: np.ndarray) -> float:
+        return float(-(p[p > 0] * np.log(p[p > 0])).sum())
+
+    parts = entropy(joint.sum(1)), entropy(joint.sum(0))
+    return 2 * (sum(parts) - entropy(joint.ravel())) / sum(parts) if sum(parts) > 0 else 0.0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
 # Evaluation (section 3.5.1)
 # ---------------------------------------------------------------------------------------------------------------------
 class Segmented(NamedTuple):
@@ -1226,6 +1223,12 @@ def print_table(segmentation: dict) -> None:
     rows = {title: segmentation[mode] for mode, title in modes.items() if mode in segmentation} | segmentation["floors"]
     for name, row in rows.items():
         print(f"{name:38}" + "".join(f"{row[key]:>9.2f}" for key in keys))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Training
+# ---------------------------------------------------------------------------------------------------------------------
+LOG_INTERVAL = 50  # updates between rows of updates.csv
 
 
 def start_wandb(args: Args, run_dir: Path) -> None:
