@@ -18,6 +18,16 @@ HOPPER = [
     *("--checkpoint-interval", "1", "--eval-episodes", "2", "--kle-rollback"),
 ]
 
+LONG = [*SMALL, "--total-timesteps", "5120"]  # 20 iterations: time enough to be stopped in the middle
+
+
+@pytest.fixture(scope="session")
+def long_run(tmp_path_factory) -> Path:
+    """An undisturbed run of twice the length."""
+    folder = tmp_path_factory.mktemp("long")
+    run(*LONG, "--run-dir", "run", cwd=folder)
+    return folder / "run"
+
 
 def rows(folder: Path) -> int:
     path = folder / "updates.csv"
@@ -53,7 +63,7 @@ def test_killed_and_resumed_on_a_mujoco_task(tmp_path):
 
 
 def test_killed_and_resumed_with_several_environments(tmp_path):
-    flags = [*SMALL, "--num-envs", "2", "--num-steps", "128", "--bootstrap-truncated", "--kl-samples", "batch"]
+    flags = [*LONG, "--num-envs", "2", "--num-steps", "128", "--bootstrap-truncated", "--kl-samples", "batch"]
     run(*flags, "--run-dir", "whole", cwd=tmp_path)
     stop_in_the_middle(flags, tmp_path / "killed", signal.SIGKILL, 3)
     run(*flags, "--run-dir", "killed", "--resume", cwd=tmp_path)
@@ -61,13 +71,13 @@ def test_killed_and_resumed_with_several_environments(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1])
-def test_a_signal_checkpoints_and_ends(number, small_run, tmp_path):
-    flags = [flag if flag != "1" else "100000" for flag in SMALL]  # no checkpoint but the signal's
+def test_a_signal_checkpoints_and_ends(number, long_run, tmp_path):
+    flags = [flag if flag != "1" else "100000" for flag in LONG]  # no checkpoint but the signal's
     assert stop_in_the_middle(flags, tmp_path / "run", number, 2) == 128 + number
     assert (tmp_path / "run" / "checkpoint.pt").exists() and not (tmp_path / "run" / "result.json").exists()
     done = run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path)
     assert "differs" not in done.stderr
-    assert_same_run(small_run, tmp_path / "run")
+    assert_same_run(long_run, tmp_path / "run")
 
 
 def test_resume_starts_where_there_is_nothing_and_is_done_where_all_is(small_run, tmp_path):
@@ -150,12 +160,12 @@ def test_killed_between_the_two_renames_of_a_checkpoint(small_run, tmp_path):
     assert_same_run(small_run, tmp_path / "run")
 
 
-def test_killed_before_the_first_checkpoint(small_run, tmp_path):
-    flags = [flag if flag != "1" else "100000" for flag in SMALL]
+def test_killed_before_the_first_checkpoint(long_run, tmp_path):
+    flags = [flag if flag != "1" else "100000" for flag in LONG]
     stop_in_the_middle(flags, tmp_path / "run", signal.SIGKILL, 4)
     assert not (tmp_path / "run" / "checkpoint.pt").exists()
     run(*flags, "--run-dir", "run", "--resume", cwd=tmp_path)
-    assert_same_run(small_run, tmp_path / "run")
+    assert_same_run(long_run, tmp_path / "run")
 
 
 def test_stopped_right_after_a_resume(small_run, tmp_path):
@@ -191,7 +201,7 @@ def test_another_machines_episode_is_said(small_run, tmp_path, monkeypatch):
     assert "replayed episode differs" in done.stderr
 
 
-def test_a_full_disk_stops_the_run_with_a_whole_checkpoint(small_run, tmp_path):
+def test_a_full_disk_stops_the_run_with_a_whole_checkpoint(long_run, tmp_path):
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk], capture_output=True, text=True)
@@ -199,7 +209,7 @@ def test_a_full_disk_stops_the_run_with_a_whole_checkpoint(small_run, tmp_path):
         pytest.skip(f"cannot mount a small disk here: {mount.stderr.strip()}")
     try:
         process = subprocess.Popen(
-            command(*SMALL, "--run-dir", disk / "run"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            command(*LONG, "--run-dir", disk / "run"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         while rows(disk / "run") < 3:
             assert process.poll() is None
@@ -212,8 +222,8 @@ def test_a_full_disk_stops_the_run_with_a_whole_checkpoint(small_run, tmp_path):
         assert err.count("\n") == 1 and "No space left" in err and "--resume" in err, err
         (disk / "filler").unlink()
         shutil.copytree(disk / "run", tmp_path / "run")
-        run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
-        assert_same_run(small_run, tmp_path / "run")
+        run(*LONG, "--run-dir", "run", "--resume", cwd=tmp_path)
+        assert_same_run(long_run, tmp_path / "run")
     finally:
         subprocess.run(["umount", "--lazy", disk], check=True)
 
