@@ -421,7 +421,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a recorded episode. Raises UsageError."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return {**arrays, "actions": arrays["actions"], "rewards": arrays["rewards"], "seed": arrays["seed"]}
+            needed = {name: arrays[name] for name in ("actions", "rewards", "seed")}  # KeyError where one is missing
+            return {**arrays, **needed}
     except (KeyError, ValueError, zipfile.BadZipFile, EOFError, OSError) as error:
         raise UsageError(f"--out {path}: no recording: {first_line(error)}") from None
 

@@ -320,7 +320,7 @@ def find_episodes(folder: Path) -> Play:
         require(same, "--prepare", path, "its SHA-256 is not the manifest's, the file was changed or damaged")
         repeats = options.get("frame_skip", 4) if env_id.startswith("ALE/") else 1
         lengths[path] = len(read_arrays(path)["actions"]) * repeats
-    fps = {"TorcsLike-v0": 50}.get(env_id, 60)
+    fps = 50 if env_id == "TorcsLike-v0" else 60
     return Play(env_id, fps, lengths, options)
 
 
@@ -446,7 +446,7 @@ def cut_clips(folder: Path, args: Args, plays: dict[str, Play], cuts: dict[str, 
     if env_id in RULES:
         write_whole(folder / "rules.txt", (RULES[env_id] + "\n").encode())
     write_json(folder / "prepared.json", {"env_id": env_id, "seed": args.seed, "clips": made})
-    find_clips(folder, 1)
+    find_clips(folder, 1)  # raises where what was made is not alike
 
 
 # ---------------------------------------------------------------------------------------------------------------------
