@@ -88,7 +88,7 @@ def kill(script: Path, flags: list, folder: Path, number: int, watched: str, at_
 
 
 @pytest.mark.parametrize(
-    "extra", [[], ["--num-envs", 2, "--frame-skip", 3, "--total-timesteps", 24_000]], ids=["one", "two"]
+    "extra", [[], ["--num-envs", 2, "--frame-skip", 3, "--total-timesteps", 18_000]], ids=["one", "two"]
 )
 def test_a_killed_dqn_ends_with_the_same_bytes(extra, teacher, tmp_path):
     """Killed in mid-episode, hundreds of frames after a checkpoint: the replay file has been written on."""
