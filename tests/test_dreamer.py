@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from conftest import ROOT, beliefs_of_play, kill_twice, needs_compiler, run
 
 from cleanrl_thesis import dreamer_v2 as method
+from cleanrl_thesis import ppo_fourrooms as rooms
 
 sys.path.append(str(ROOT / "benchmark"))
 import dreamer_goals  # noqa: E402
@@ -853,6 +854,23 @@ def test_learning_curve_in_bfloat16_stays_within_seeds_of_float32(tmp_path):
             single,
             half,
         )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dreamer_v2", "hwm_dreamer", "hwm_hrl_dreamer"])
+def test_the_world_model_learns_what_the_mean_frame_does_not_show(name, tmp_path):
+    """300 updates of `--size xs`: less than half of the image loss that is left where every frame is drawn as their mean."""
+    flags = ["--prefill", 10_000, "--total-timesteps", 11_500, "--starts", 8, "--horizon", 3, "--eval-episodes", 4]
+    run(*flags, "--run-dir", "run", cwd=tmp_path, script=ROOT / "cleanrl_thesis" / f"{name}.py")
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    lengths = state["collector"]["lengths"].tolist()
+    rows = np.fromfile(tmp_path / "run" / "replay.dat", method.RECORD).reshape(len(lengths), -1)
+    records = np.concatenate([row[:length] for row, length in zip(rows, lengths)])[::5]
+    frames = rooms.painter(11, 22).draw(records["pose"].astype(int), records["goal"].astype(int)).astype(np.float64)
+    x = (frames - frames.mean(0)) / state["learner"]["model"]["frame_scale"].numpy()
+    of_the_mean_frame = 0.5 * np.square(x).sum((1, 2, 3)).mean()
+    *_, last = csv.DictReader((tmp_path / "run" / "updates.csv").read_text().splitlines())
+    assert float(last["losses/image"]) < 0.5 * of_the_mean_frame
 
 
 def test_copied_alone(small_run, tmp_path):
