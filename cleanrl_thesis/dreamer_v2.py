@@ -488,7 +488,7 @@ def make_info(games: FourRoomsGames) -> dict[str, np.ndarray]:
 
 
 class FourRoomsVectorEnv(gym.vector.VectorEnv):
-    """The same game N times, by tables; a game that ends begins anew within the same step."""
+    """FourRooms N times side by side, by tables; a game that ends begins anew within the same step."""
 
     metadata = {
         "render_modes": ["rgb_array"],
@@ -516,7 +516,7 @@ class FourRoomsVectorEnv(gym.vector.VectorEnv):
         return self.painter.draw(self.games.poses, self.games.goals)
 
     def reset(self, *, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        """Begin every game anew; a list of seeds gives each game what `FourRoomsEnv.reset(seed=)` gives it."""
+        """Begin every game anew; a list of seeds gives each game its own, as if it were played alone."""
         if seed is not None:
             is_number = isinstance(seed, (int, np.integer))
             seeds = np.random.SeedSequence(int(seed)).generate_state(self.num_envs).tolist() if is_number else seed
