@@ -11,10 +11,7 @@ SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/pytho
 FEWER_SEEDS=${FEWER_SEEDS:-$(echo $SEEDS | cut -d " " -f 1-3)}
 ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
 OTHER_ALPHAS=${OTHER_ALPHAS:-0.93 1.0 0.5 0.7 0.8 0.3 0.9}
-code=0
-sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
-  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
-}
+. benchmark/sweep_lines.sh  # sweep
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
   echo "teacher_seed$seed --seed $seed"

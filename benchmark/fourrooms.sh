@@ -12,10 +12,7 @@ cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4} AGENTS=${AGENTS:-dreamer hwm hrl hwm_fixed hrl_fixed} SIZE=${SIZE:-xs} ENV_ID=${ENV_ID:-FourRooms11-v0}
 WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/dreamer_$SIZE} FLAGS=${FLAGS---compile}
 INTERVAL=${INTERVAL:-4}
-code=0
-sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
-  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
-}
+. benchmark/sweep_lines.sh  # sweep
 script() {  # AGENT: its file and its own flags
   case $1 in
     dreamer) echo dreamer_v2.py ;;

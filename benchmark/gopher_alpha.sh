@@ -13,10 +13,7 @@ SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} R
 OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1} TEACHER=${TEACHER-$RUNS/teacher_seed1}
 ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
 TEMPERATURES=${TEMPERATURES-0.1 0} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0}
-code=0
-sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
-  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
-}
+. benchmark/sweep_lines.sh  # sweep
 mkdir -p "$RUNS"
 if [ -n "$TEACHER" ]; then
   # lives end episodes as in Baselines; targets of three steps stand for its prioritised replay; the rate falls, for the last network

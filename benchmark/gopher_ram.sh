@@ -7,10 +7,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/gopher_ram}
 FLAGS="--obs-type ram --n-step 3 --life-loss-ends --anneal-lr --total-timesteps 2500000"
-code=0
-sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
-  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
-}
+. benchmark/sweep_lines.sh  # sweep
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
   echo "seed$seed" --seed "$seed"

@@ -8,10 +8,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
 RUNGS=${RUNGS:-narrow surprise faithful reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
-code=0
-sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
-  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
-}
+. benchmark/sweep_lines.sh  # sweep
 mkdir -p "$RUNS"
 record() {  # DEMOS flags...: episodes of the player stopped at 1,100,000 steps, unless they are there
   [ -e "$PLAYER/$1/manifest.json" ] || "$PYTHON" cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-model \

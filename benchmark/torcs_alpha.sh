@@ -11,10 +11,7 @@ EXPERTS=${EXPERTS:-1 2} SEEDS=${SEEDS:-1 2 3} MORE_SEEDS=${MORE_SEEDS-4 5} WORKE
 OUT=${OUT:-benchmark/results/torcs}
 ALPHAS=${ALPHAS:-0.5 0.0 1.0 0.7 0.3 0.9 0.1 0.8 0.2 0.6 0.4}
 MIXED=${MIXED:-0.5 0.0 1.0}
-code=0
-sweep() {  # name, then the words that all its runs share; on standard input a line for each: its folder's name and its own flags
-  "$PYTHON" benchmark/sweep.py --lines - --runs "$RUNS" --workers "$WORKERS" ${SLURM:+--slurm-template-path "$SLURM"} --name "$1" --command "$PYTHON ${*:2}"
-}
+. benchmark/sweep_lines.sh  # sweep
 mkdir -p "$RUNS"
 for seed in $EXPERTS; do
   echo "expert_seed$seed --seed $seed"
