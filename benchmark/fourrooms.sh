@@ -29,10 +29,13 @@ script() {  # AGENT: its file and its own flags
     *) echo "AGENTS=$AGENTS: must be of dreamer, hwm, hrl, hwm_fixed, hrl_fixed, dreamer_{sharp,slow,early,far,uniform,eps}" >&2; exit 2 ;;
   esac
 }
-for agent in $AGENTS; do script "$agent" >/dev/null; done
 less_play() {  # AGENT: steps of random play at first that it has fewer than the others, and so in all
   case $1 in dreamer_early) echo 800000 ;; *) echo 0 ;; esac
 }
+for agent in $AGENTS; do
+  script "$agent" >/dev/null
+  [ "${STEPS:-1000000}" -gt "$(less_play "$agent")" ] || { echo "STEPS=$STEPS: must be more than $(less_play "$agent") for $agent" >&2; exit 2; }
+done
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
   for agent in $AGENTS; do

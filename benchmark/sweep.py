@@ -14,6 +14,7 @@ The command must understand `--env-id`, `--seed`, `--run-dir`, `--resume` and `-
 end, as all methods here do (hwm_segment.py has no `--env-id`: its environment is that of the demonstrations).
 """
 
+import contextlib
 import fcntl
 import hashlib
 import itertools
@@ -169,7 +170,7 @@ def line_runs(args: Args) -> list[Run]:
     except (OSError, ValueError) as error:
         raise UsageError(f"--lines {args.lines}: cannot be read: {error}") from None
     require(bool(lines), f"--lines {args.lines}: holds no run")
-    strange = next((name for name, *_ in lines if not re.fullmatch(r"[\w.=-]+", name)), None)
+    strange = next((name for name, *_ in lines if not re.fullmatch(r"(?!\.+$)[\w.=-]+", name)), None)
     require(strange is None, f"--lines {args.lines}: {strange}: must be the name of a folder")
     return [make_run(args, name, flags) for name, *flags in lines]
 
@@ -200,18 +201,34 @@ def check_begun(args: Args, runs: list[Run], manifests: dict[Path, list[Run]]) -
             require(command == run.command, f"{args.runs / run.name}: {other} has no such run; give another --runs")
 
 
-def open_manifest(args: Args, runs: list[Run]) -> None:
-    """Write the manifest, unless it is there. Raises UsageError where runs were begun otherwise, or cannot begin."""
+def check_manifest(args: Args, runs: list[Run]) -> None:
+    """Raise UsageError where runs were begun otherwise, or cannot begin."""
     require(args.runs.is_dir() or not args.runs.exists(), f"--runs {args.runs}: must be a folder")
     for script in [word for word in shlex.split(args.command) if word.endswith(".py")][:1]:
         require(Path(script).is_file(), f"--command {args.command}: there is no {script}")
     path = manifest_path(args)
     manifests = {other: read_manifest(other) for other in sorted(args.runs.glob("*.jsonl"))}
-    if manifests.get(path) == runs:
-        return
-    if args.lines is None:  # lines may change, and each run compares its arguments itself
+    if (
+        manifests.get(path) != runs and args.lines is None
+    ):  # lines may change, and each run compares its arguments itself
         check_begun(args, runs, manifests)
+
+
+@contextlib.contextmanager
+def hold(args: Args):
+    """Keep the sweep for oneself. Raises UsageError where it is running."""
     args.runs.mkdir(parents=True, exist_ok=True)
+    with open(manifest_path(args).with_suffix(".lock"), "w") as lock:  # beside the manifest, which is replaced
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(f"{manifest_path(args)}: this sweep is running") from None
+        yield
+
+
+def write_manifest(args: Args, runs: list[Run]) -> None:
+    """Write the manifest, whole or not at all."""
+    path = manifest_path(args)
     draft = path.with_suffix(".tmp")
     with open(draft, "w") as file:
         file.writelines(run.line() + "\n" for run in runs)
@@ -232,7 +249,7 @@ def is_done(args: Args, run: Run, result: dict | None) -> bool:
     """Whether a run has come to the end of its schedule, or to its `--stop-at`."""
     words = command_of(args, run)
     stop_at = int(words[words.index("--stop-at") + 1]) if "--stop-at" in words else math.inf
-    return result is not None and (result["complete"] or result["global_step"] >= stop_at)
+    return result is not None and (result.get("complete", False) or result.get("global_step", 0) >= stop_at)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -429,25 +446,20 @@ class Signals:
 def run_here(args: Args, runs: list[Run]) -> int:
     """Run what is not done with a pool of workers. Returns the exit code."""
     (args.runs / "logs").mkdir(exist_ok=True)
-    with open(manifest_path(args)) as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UsageError(f"{manifest_path(args)}: this sweep is running") from None
-        signals = Signals()
-        signals.install()
-        sweep = begin_sweep(args, runs)
-        workers = [threading.Thread(target=work, args=(args, sweep), daemon=True) for _ in range(args.workers)]
+    signals = Signals()
+    signals.install()
+    sweep = begin_sweep(args, runs)
+    workers = [threading.Thread(target=work, args=(args, sweep), daemon=True) for _ in range(args.workers)]
+    for worker in workers:
+        worker.start()
+    try:
+        watch(sweep, workers, signals)
+    finally:  # also where the table cannot be printed: no run is left behind
+        if any(worker.is_alive() for worker in workers):
+            sweep.stopped = sweep.stopped or "interrupted"
+            signal_all(sweep, signal.SIGTERM)
         for worker in workers:
-            worker.start()
-        try:
-            watch(sweep, workers, signals)
-        finally:  # also where the table cannot be printed: no run is left behind
-            if any(worker.is_alive() for worker in workers):
-                sweep.stopped = sweep.stopped or "interrupted"
-                signal_all(sweep, signal.SIGTERM)
-            for worker in workers:
-                worker.join()
+            worker.join()
     return report_end(args, sweep, signals)
 
 
@@ -558,8 +570,10 @@ def main(args: Args) -> int:
     template = args.slurm_template_path
     require(template is None or template.is_file(), f"--slurm-template-path {template}: no such file")
     job_name = "" if template is None else free_job_name(args)
-    open_manifest(args, runs)
-    return run_here(args, runs) if template is None else submit(args, runs, job_name)
+    check_manifest(args, runs)
+    with hold(args):
+        write_manifest(args, runs)
+        return run_here(args, runs) if template is None else submit(args, runs, job_name)
 
 
 def cli() -> int:

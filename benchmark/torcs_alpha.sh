@@ -15,8 +15,9 @@ MIXED=${MIXED:-0.5 0.0 1.0}
 mkdir -p "$RUNS"
 for seed in $EXPERTS; do
   echo "expert_seed$seed --seed $seed"
-done | sweep experts cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220
-[ -e "$RUNS/expert_seed${EXPERTS%% *}/result.json" ] || { echo "the students wait for $RUNS/expert_seed${EXPERTS%% *}"; exit; }
+done | sweep experts cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220 || code=$?
+[ "$code" -le 1 ] || exit "$code"
+[ -e "$RUNS/expert_seed${EXPERTS%% *}/result.json" ] || { echo "the students wait for $RUNS/expert_seed${EXPERTS%% *}"; exit "$code"; }
 for seed in $SEEDS $MORE_SEEDS; do
   human="$RUNS/human_seed$seed"
   [ -e "$human/manifest.json" ] || "$PYTHON" benchmark/torcs_players.py --seed "$seed" --demos "$human"

@@ -185,8 +185,13 @@ def test_two_sweeps_at_once_are_refused(tmp_path):
     process = start([*SMALL, "--command", f"{COMMAND[1]} --total 300"], tmp_path)
     while len(records(tmp_path)) < 2:
         time.sleep(0.01)
-    _, err = run([*SMALL, "--command", f"{COMMAND[1]} --total 300"], tmp_path, code=2)
-    assert "this sweep is running" in err
+    before = (tmp_path / "runs" / "sweep.jsonl").read_text()
+    for seeds in ([], ["--num-seeds", "3"]):
+        _, err = run([*SMALL, *seeds, "--command", f"{COMMAND[1]} --total 300"], tmp_path, code=2)
+        assert "this sweep is running" in err or seeds and "is of another sweep" in err
+    (tmp_path / "lines").write_text("more --env-id A-v0 --seed 1\n")
+    _, err = run([*COMMAND, "--lines", "lines"], tmp_path, code=2)
+    assert "this sweep is running" in err and (tmp_path / "runs" / "sweep.jsonl").read_text() == before
     process.send_signal(signal.SIGTERM)
     process.communicate(timeout=20)
 
@@ -381,15 +386,15 @@ with open({calls!r}, "a") as file:
     file.write(json.dumps(sys.argv[1:]) + "\\n")
 if "--run-dir" in sys.argv:
     run_dir = Path(sys.argv[sys.argv.index("--run-dir") + 1])
-    run_dir.mkdir(parents=True)
+    run_dir.mkdir(parents=True, exist_ok=True)
     (run_dir / "result.json").write_text(json.dumps({{"complete": True, "global_step": 0}}))
 """
 
 
-def study(script: str, folder: Path, **settings: str) -> list[list[str]]:
+def study(script: str, folder: Path, stand_in: str = STAND_IN, **settings: str) -> list[list[str]]:
     """The command lines that a study sends, from a Python that only writes them down."""
     python = folder / "python"
-    python.write_text(STAND_IN.format(python=sys.executable, calls=str(folder / "calls")))
+    python.write_text(stand_in.format(python=sys.executable, calls=str(folder / "calls")))
     python.chmod(0o755)
     env = {
         **os.environ,
@@ -430,6 +435,36 @@ def test_every_line_of_a_study_is_a_run_that_its_method_understands(script, sett
     assert all("--stop-at 260000 " in args and args.count("--stop-at") == 1 for args in early)
 
 
+@pytest.mark.parametrize(
+    "script, settings, words",
+    [
+        ("hwm_segment.sh", {"RUNGS": "narrow typo"}, "RUNGS=narrow typo"),
+        ("fourrooms.sh", {"AGENTS": "hwm typo"}, "AGENTS=hwm typo"),
+        ("fourrooms.sh", {"AGENTS": "dreamer_early", "STEPS": "500000"}, "STEPS=500000"),
+    ],
+)
+def test_a_study_that_cannot_be_sends_nothing(script, settings, words, tmp_path):
+    with pytest.raises(subprocess.CalledProcessError) as error:
+        study(script, tmp_path, **settings)
+    assert error.value.returncode == 2 and error.value.stderr.decode().startswith(words)
+    assert not (tmp_path / "calls").exists() and not (tmp_path / "runs").exists()
+
+
+def test_students_of_a_driver_need_the_first_expert_alone(tmp_path):
+    fails = 'if "expert_seed2" in " ".join(sys.argv):\n    sys.exit(1)\n'
+    stand_in = STAND_IN.replace('if "--run-dir"', fails + 'if "--run-dir"')
+    with pytest.raises(subprocess.CalledProcessError) as error:
+        study("torcs_alpha.sh", tmp_path, stand_in=stand_in)
+    calls = [json.loads(line) for line in (tmp_path / "calls").read_text().splitlines()]
+    assert error.value.returncode == 1 and calls[-1][0] == "benchmark/torcs_report.py"
+
+
+def test_a_study_runs_in_a_folder_with_a_blank(tmp_path):
+    (tmp_path / "my python").mkdir()
+    calls = study("gopher_ram.sh", tmp_path / "my python")
+    assert calls[-1][0] == "benchmark/gopher_ram.py"
+
+
 LINES = "one --bonus 1\n\ntwo --bonus 2 --stop-at 12\n"
 
 
@@ -452,6 +487,7 @@ def test_lines_are_runs_and_may_change(tmp_path):
         ("", [], ["--lines lines", "holds no run"]),
         ("a --x 1\na --x 2", [], ["--lines lines", "2 runs", "folder a"]),
         ("../a --x 1", [], ["--lines lines", "../a"]),
+        (".. --x 1", [], ["--lines lines", "..: must be the name of a folder"]),
         ("a 'b", [], ["--lines lines", "cannot be read"]),
         ("a", ["--env-ids", "A-v0"], ["--lines lines", "--env-ids"]),
         (None, [], ["--lines lines", "cannot be read"]),
