@@ -211,7 +211,7 @@ def needs_table(runs: list[dict], stages: tuple[int, ...] = STAGES) -> list[str]
 
 
 def differences(rows: list[dict]) -> list[str]:
-    """Each agent less the one that it adds to, with Welch's 95% interval; empty where one of them has a single seed."""
+    """Each agent less the one that it adds to, with Welch's 95% interval where both have two seeds or more and all came so far."""
     lines = []
     for later, earlier in (("hwm", "dreamer"), ("hrl", "hwm"), ("hwm_fixed", "hwm"), ("hrl_fixed", "hrl")):
         cells = []
@@ -219,12 +219,13 @@ def differences(rows: list[dict]) -> list[str]:
             groups = [
                 [row[name] for row in rows if row["agent"] == agent and has_ended(row)] for agent in (later, earlier)
             ]
-            if min(map(len, groups)) > 1 and not np.isnan(groups[0] + groups[1]).any():
-                low, high = stats.ttest_ind(*groups, equal_var=False).confidence_interval()
-                cells.append(
-                    f"{np.mean(groups[0]) - np.mean(groups[1]):+,.{digits}f} [{low:+,.{digits}f}, {high:+,.{digits}f}]"
-                )
-        if len(cells) == 3:
+            if min(map(len, groups)) < 2 or np.isnan(groups[0] + groups[1]).any():
+                cells.append("")
+                continue
+            low, high = stats.ttest_ind(*groups, equal_var=False).confidence_interval()
+            middle = np.mean(groups[0]) - np.mean(groups[1])
+            cells.append(f"{middle:+,.{digits}f} [{low:+,.{digits}f}, {high:+,.{digits}f}]")
+        if any(cells):
             lines.append(f"| {AGENTS[later][0]} less {AGENTS[earlier][0]} | {' | '.join(cells)} |")
     head = ["", "| 95% by Welch | steps to 0.5 | last 200 episodes | greedy |", "|" + "---|" * 4]
     return head + lines if lines else []

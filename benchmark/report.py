@@ -423,7 +423,7 @@ def tell(
     seeds = sorted({len(values) for group in groups for values in group.values()})
     middle, low, high = (bootstrap if seeds[0] > 1 else bootstrap_tasks)(statistic, *groups)
     counts = f"{len(groups[0])} task{'s' * (len(groups[0]) > 1)}, {' to '.join(map(str, sorted({seeds[0], seeds[-1]})))} seed{'s' * (seeds[-1] > 1)}"
-    if seeds[0] < 2 and len(groups[0]) < 2:
+    if len(groups[0]) < 2:
         return Finding(claim, theirs, f"{middle:+.{digits}f}, {counts}", "open")
     text = f"{middle:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}], {counts}"
     by = "" if seeds[0] > 1 else ", by tasks"

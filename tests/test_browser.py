@@ -220,6 +220,8 @@ async def participate(browser, address: str, number: int, judged: list) -> tuple
         await page.dblclick("#send")
         if offline:
             await page.wait_for_selector("#trouble:visible", timeout=10_000)
+            controls = "[...document.querySelectorAll('.verdict, #why, #send')].map(control => control.disabled)"
+            assert await page.evaluate(controls) == [True] * 4  # a change on its way would be lost
             await context.set_offline(False)
         given.append((verdict, why))
         judged.append(number)

@@ -1104,6 +1104,9 @@ def test_differences_of_agents():
         line.endswith(f"| {mean:+.3f} [{mean - half:+.3f}, {mean + half:+.3f}] |")
         and "HWM Dreamer less Dreamer" in line
     )
+    rows[0]["steps_to_0.5"] = np.nan
+    (line,) = dreamer_report.differences(rows)[3:]
+    assert line.split(" | ")[1:3] == ["", f"{mean:+.3f} [{mean - half:+.3f}, {mean + half:+.3f}]"]
     assert dreamer_report.differences(rows[2:]) == []
 
 

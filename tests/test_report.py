@@ -366,3 +366,9 @@ def test_an_earlier_report_without_curves(study, tmp_path):
         report.Args(runs=tmp_path / "none", steps=102_400, out=tmp_path / "out", known=tmp_path / "out", workers=1)
     )
     assert (tmp_path / "out" / "learning_curves.png").exists()
+
+
+def test_a_single_task_leaves_a_claim_open():
+    """Seeds of one task say nothing of others."""
+    found = report.tell("", "", report.minus, {"Hopper": [1.0, 0.9]}, {"Hopper": [0.5, 0.4]})
+    assert (found.measured, found.verdict) == ("+0.50, 1 task, 2 seeds", "open")
