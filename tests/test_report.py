@@ -370,5 +370,5 @@ def test_an_earlier_report_without_curves(study, tmp_path):
 
 def test_a_single_task_leaves_a_claim_open():
     """Seeds of one task say nothing of others."""
-    found = report.tell("", "", report.minus, {"Hopper": [1.0, 0.9]}, {"Hopper": [0.5, 0.4]})
+    found = report.tell("", "", report.minus, {"Hopper": np.array([1.0, 0.9])}, {"Hopper": np.array([0.5, 0.4])})
     assert (found.measured, found.verdict) == ("+0.50, 1 task, 2 seeds", "open")
