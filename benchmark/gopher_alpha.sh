@@ -4,7 +4,7 @@
 # the teacher takes about 3 hours of a core with bfloat16, several times as long without; its replay takes 8 GB.
 #   benchmark/gopher_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
-#   THREADS=2 WAIT=active benchmark/gopher_alpha.sh     the teacher with both cores, where nothing else runs
+#   THREADS=2 benchmark/gopher_alpha.sh     the teacher with both cores, where nothing else runs
 #   WORKERS=50 SLURM=benchmark/slurm_template.sh benchmark/gopher_alpha.sh     students on a cluster; again for the report
 #   ALPHAS=0.0 TEMPERATURES= TEACHER= benchmark/gopher_alpha.sh     the human's clones alone, which need no teacher
 set -euo pipefail
@@ -17,8 +17,8 @@ TEMPERATURES=${TEMPERATURES-0.1 0} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0}
 mkdir -p "$RUNS"
 if [ -n "$TEACHER" ]; then
   # lives end episodes as in Baselines; targets of three steps stand for its prioritised replay; the rate falls, for the last network
-  # is the teacher. With WAIT=active two threads are faster, if nothing runs beside that spinning threads would hold up.
-  OMP_WAIT_POLICY=${WAIT:-passive} "$PYTHON" cleanrl_thesis/dqn_gopher.py --life-loss-ends --n-step 3 --anneal-lr --bf16 \
+  # is the teacher. Two threads only where nothing runs beside: those that wait spin, and would be held up by what does.
+  "$PYTHON" cleanrl_thesis/dqn_gopher.py --life-loss-ends --n-step 3 --anneal-lr --bf16 \
     --num-threads "$THREADS" --save-model --eval-episodes 400 --run-dir "$TEACHER" --resume
 fi
 student() {  # seed, α, name, more flags
