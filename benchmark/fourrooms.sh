@@ -34,7 +34,8 @@ less_play() {  # AGENT: steps of random play at first that it has fewer than the
 }
 for agent in $AGENTS; do
   script "$agent" >/dev/null
-  [ "${STEPS:-1000000}" -gt "$(less_play "$agent")" ] || { echo "STEPS=$STEPS: must be more than $(less_play "$agent") for $agent" >&2; exit 2; }
+  less=$(less_play "$agent")
+  [ -z "${STEPS:-}" ] || [ "$STEPS" -gt "$less" ] || { echo "STEPS=$STEPS: must be more than $less for $agent" >&2; exit 2; }
 done
 mkdir -p "$RUNS"
 for seed in $SEEDS; do

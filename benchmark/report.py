@@ -7,7 +7,7 @@
 Takes whatever part of the 1,210 runs of `benchmark/ppo_kle.sh` has come to `--steps`, and says which. The normalised
 episode reward (NER) of a run is where its score lies between the least and the greatest of its task, in two definitions:
 *as tabulated* (Table 4.2, found out from the study's logs): score, least and greatest are of last episodes; *as written*
-(section 4.4): the mean of the last 50 episodes, between the least and the greatest of all episodes. Least and greatest are
+(sections 4.4 and 4.5): the mean of the last 50 episodes, between the least and the greatest of all episodes. Least and greatest are
 those of the runs at hand.
 
 Intervals are 95% percentiles of a bootstrap stratified by task. Resamples of n seeds have (n - 1) / n of the variance that
@@ -58,7 +58,7 @@ AS_WRITTEN = (
     0.59,
     0.40,
     0.35,
-)  # plain PPO's Table 4.2 by the definition of section 4.4, from the study's logs
+)  # plain PPO's Table 4.2 by the definition of sections 4.4 and 4.5, from the study's logs
 
 
 @dataclass

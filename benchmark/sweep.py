@@ -208,9 +208,7 @@ def check_manifest(args: Args, runs: list[Run]) -> None:
         require(Path(script).is_file(), f"--command {args.command}: there is no {script}")
     path = manifest_path(args)
     manifests = {other: read_manifest(other) for other in sorted(args.runs.glob("*.jsonl"))}
-    if (
-        manifests.get(path) != runs and args.lines is None
-    ):  # lines may change, and each run compares its arguments itself
+    if args.lines is None and manifests.get(path) != runs:  # lines may change: each run compares its own arguments
         check_begun(args, runs, manifests)
 
 

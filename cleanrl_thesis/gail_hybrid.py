@@ -1314,8 +1314,8 @@ def discriminator_loss(
     Student and experts count the same in the entropy, the experts by their weights; the accuracy on an expert without
     weight is nan.
     """
-    # D makes Eq. 2.3.1 large: D → 1 for the student, D → 0 for experts. The prose of section 2.3.2 and of Q&A 1 says
-    # "minimise over w", and the study's code labels experts 1: both have D and 1 − D swapped, and are the same game.
+    # D makes Eq. 2.3.1 large: D → 1 for the student, D → 0 for experts. The prose of section 2.3.2 and of Q&A 1
+    # minimises over w, and the study's code labels experts 1: both have D and 1 − D swapped, and are the same game.
     l_mix = F.logsigmoid(student).mean()
     l_mix = l_mix + alpha * F.logsigmoid(-rl).mean() + (1 - alpha) * F.logsigmoid(-human).mean()
     entropies = [(F.softplus(x) - torch.sigmoid(x) * x).mean() for x in (student, rl, human)]

@@ -229,7 +229,7 @@ def test_tiles_are_squares_of_two_by_two_pixels():
 def test_sizes(size):
     args = method.complete_args(method.Args(size=size))
     if size == "thesis":
-        assert args.stoch * args.classes + args.deter == 1_624  # section 3.4 and the Q&A
+        assert args.stoch * args.classes + args.deter == 1_624  # Q&A 5
         args.depth = args.hidden_size = args.head_size = 8  # the shapes are what is looked at
     model = method.WorldModel(args, 3)
     frames = torch.zeros(2, args.frame_side, args.frame_side, 3)
