@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import functools
 import importlib
 import json
 import os
@@ -153,7 +154,8 @@ def test_a_runner_that_dies_leaves_no_run_behind(end, tmp_path):
     """Killed, with nowhere to print to, or with its terminal gone: the runs write a checkpoint and end."""
     command = [sys.executable, str(SCRIPT), *SMALL, "--command", f"{COMMAND[1]} --total 400"]
     with open("/dev/full" if end == "full disk" else os.devnull, "w") as out:
-        process = subprocess.Popen(command, cwd=tmp_path, stdout=out, stderr=subprocess.PIPE)
+        hear = functools.partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)  # also where the tests run under `nohup`
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=out, stderr=subprocess.PIPE, preexec_fn=hear)
     while end != "full disk" and len(records(tmp_path)) < 2:
         time.sleep(0.01)
     if end != "full disk":
