@@ -15,7 +15,7 @@ format that `distill_hybrid.py --demos` and `gail_hybrid.py --demos-human` read.
 | clock | this process': 60 frames a second, the driving task 50; the browser sends which keys are held, and shows pictures |
 | action | the keys that are held when the frame begins; Atari's games are played frame by frame, where agents act for 4 frames |
 | driving by keys | steering turns within 0.25 s as far as half of the grip allows at that speed, pedals in 0.2 s; recorded is what the car was given |
-| an episode | is on disk before the next one begins; one that is broken off, or whose page loses focus, is not kept |
+| an episode | is on disk before the next one begins; one that is broken off, whose page loses focus or draws nothing for a second, is not kept |
 | `t_ns` | when each action was taken, in nanoseconds from the episode's beginning |
 
 Each file follows from its seed and actions: `--verify` plays all of them again and compares every reward.
@@ -125,10 +125,11 @@ def require(holds: bool, flag: str, value: object, allowed: str) -> None:
         raise UsageError(f"{flag} {value}".strip() + f": {allowed}")
 
 
-def read_player(folder: Path) -> str:
-    """Who is recorded in a folder. Raises UsageError."""
+def read_about(folder: Path) -> tuple[str, dict]:
+    """Who is recorded in a folder, and with which options of the game. Raises UsageError."""
     try:
-        return str(json.loads((folder / "manifest.json").read_text())["player"])
+        manifest = json.loads((folder / "manifest.json").read_text())
+        return str(manifest["player"]), dict(manifest.get("options") or {})
     except (OSError, ValueError, KeyError, TypeError):
         raise UsageError(f"--out {folder}: holds no recordings, it has no readable manifest.json") from None
 
@@ -137,7 +138,7 @@ def complete_args(args: Args) -> Args:
     """Fill in the folder, and check all. Raises UsageError."""
     reads = args.verify or args.export_minari is not None
     if reads and args.player is None and args.out is not None:
-        args.player = read_player(args.out)
+        args.player = read_about(args.out)[0]
     elif not args.practice:
         require(args.player is not None, "--player", "", "is needed: who plays? (--practice records nothing)")
         named = re.fullmatch(r"[\w-]{1,40}", args.player) is not None
@@ -230,7 +231,7 @@ class Apple(Game):
     )
     keys, unit = "Arrow keys or W A S D move; two at once move diagonally.", "apples"
 
-    def __init__(self, args: Args):
+    def __init__(self, args: Args, recorded: dict):
         load_method("dqn_apple")
         self.env = gym.make("AppleGame-v0", disable_env_checker=True)
         self.fps = self.env.metadata["render_fps"]
@@ -247,15 +248,16 @@ class Atari(Game):
 
     rules = "Play as well as you can. The round ends when the game does."
     keys, unit = "Arrow keys or W A S D move; the space bar is the button.", "points"
-    options = {"frame_skip": 1, "noop_max": 30}
 
-    def __init__(self, args: Args):
+    def __init__(self, args: Args, recorded: dict):
         method = load_method("dqn_gopher")
+        self.options = {"frame_skip": 1, "noop_max": 30} | recorded
         try:
             self.env = method.make_atari(args.env_id, frame_stack=1, **self.options)
         except method.UsageError as error:
             raise UsageError(str(error)) from None
-        self.fps, self.numbers = method.ATARI_FPS, {move.name: i for i, move in enumerate(self.env.moves)}
+        self.fps = method.ATARI_FPS / self.options["frame_skip"]
+        self.numbers = {move.name: i for i, move in enumerate(self.env.moves)}
         if args.env_id == "ALE/Gopher-v5":
             self.rules = (
                 "Keep the gopher from the three carrots. It digs holes up to the garden: stand over a hole and press the "
@@ -298,9 +300,9 @@ class Driving(Game):
     keys = "Left and right arrow, or A and D, steer; up or W is the gas, down or S the brake. A gamepad works too."
     unit, action_dtype = "m", np.float32
 
-    def __init__(self, args: Args):
+    def __init__(self, args: Args, recorded: dict):
         self.method = load_method("ddpg_torcs_like")
-        self.options = {"track": args.track_name, "reward": "distance", "brake": args.brake}
+        self.options = recorded or {"track": args.track_name, "reward": "distance", "brake": args.brake}
         try:
             self.env = gym.make("TorcsLike-v0", disable_env_checker=True, **self.options)
         except ValueError as error:
@@ -329,13 +331,15 @@ class Driving(Game):
         self.speed = float(obs[SPEED_INDEX]) * SPEED_SCALE
 
 
-def make_game(args: Args) -> Game:
-    """The game of `--env-id`. Raises UsageError."""
-    if args.env_id.startswith("ALE/"):
-        return Atari(args)
+def make_game(args: Args, recorded: dict | None = None) -> Game:
+    """The game of `--env-id`, to be played again with the options that were recorded. Raises UsageError."""
     games = {"AppleGame-v0": Apple, "TorcsLike-v0": Driving}
-    require(args.env_id in games, "--env-id", args.env_id, f"must be {', '.join(games)} or ALE/*-v5")
-    return games[args.env_id](args)
+    atari = args.env_id.startswith("ALE/")
+    require(atari or args.env_id in games, "--env-id", args.env_id, f"must be {', '.join(games)} or ALE/*-v5")
+    try:
+        return (Atari if atari else games[args.env_id])(args, recorded or {})
+    except TypeError as error:
+        raise UsageError(f"--out {args.out}: options {recorded} are none of {args.env_id}: {error}") from None
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -371,6 +375,7 @@ class Recordings:
     about: dict
     files: dict[str, str] = field(default_factory=dict)
     scores: list[float] = field(default_factory=list)
+    torn: bool = False  # whether a crash came between an episode and the manifest
 
     @classmethod
     def open(cls, folder: Path, about: dict) -> "Recordings":
@@ -392,7 +397,7 @@ class Recordings:
             raise UsageError(f"--out {folder}: its manifest.json cannot be read") from None
         for name, flag in (("env_id", "--env-id"), ("player", "--player"), ("options", "--track-name or --brake")):
             allowed = f"has recordings of {flag} {saved.get(name)}, now it is {about[name]}"
-            require(saved.get(name) == about[name], "--out", folder, allowed)
+            require((saved.get(name) or {}) == about[name], "--out", folder, allowed)
         for path in paths:  # a file that is not in the manifest was written just before a crash
             content = path.read_bytes()
             same = files.get(path.name, checksum := hashlib.sha256(content).hexdigest()) == checksum
@@ -401,20 +406,24 @@ class Recordings:
             recordings.scores.append(float(read_arrays(path)["rewards"].sum()))
         missing = sorted(files.keys() - recordings.files.keys())
         require(not missing, "--out", folder, f"lacks {', '.join(missing)}, which its manifest names")
+        recordings.torn = recordings.files.keys() != files.keys()
         return recordings
+
+    def write_manifest(self) -> None:
+        write_json(self.folder / "manifest.json", {"version": 1, **self.about, "files": self.files})
 
     def add(self, episode: dict[str, np.ndarray]) -> None:
         """Write an episode, and then the manifest."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if not self.files:
-            write_json(self.folder / "manifest.json", {"version": 1, **self.about, "files": {}})
+            self.write_manifest()
         content = io.BytesIO()
         np.savez(content, **episode)
         name = f"episode_{max((int(name[8:13]) for name in self.files), default=-1) + 1:05d}.npz"
         write_whole(self.folder / name, content.getvalue())
         self.files[name] = hashlib.sha256(content.getvalue()).hexdigest()
         self.scores.append(float(episode["rewards"].sum()))
-        write_json(self.folder / "manifest.json", {"version": 1, **self.about, "files": self.files})
+        self.write_manifest()
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -446,7 +455,7 @@ def replay(game: Game, episode: dict[str, np.ndarray]) -> list[np.ndarray] | Non
 
 def verify(args: Args) -> int:
     """Play every episode again and print its score. Returns the exit code: 1 where one went another way."""
-    game = make_game(args)
+    game = make_game(args, read_about(args.out)[1])
     recordings = Recordings.open(args.out, about_recordings(args, game))
     require(bool(recordings.files), "--out", args.out, "holds no recordings")
     failures = 0
@@ -464,7 +473,7 @@ def export_minari(args: Args) -> int:
     import minari
     from minari.data_collector import EpisodeBuffer
 
-    game = make_game(args)
+    game = make_game(args, read_about(args.out)[1])
     recordings = Recordings.open(args.out, about_recordings(args, game))
     require(bool(recordings.files), "--out", args.out, "holds no recordings")
     exists = args.export_minari in minari.list_local_datasets()
@@ -486,9 +495,9 @@ def export_minari(args: Args) -> int:
             buffers,
             observation_space=game.env.observation_space,
             action_space=game.env.action_space,
-            algorithm_name=f"a person, {args.player}",
+            algorithm_name=args.player,
             author=args.player,
-            description=f"{args.env_id} in the browser, {game.fps} frames a second",
+            description=f"{args.env_id}, {game.fps:g} steps a second",
             jpeg_encoding=False,
         )
     print(f"{args.export_minari}: {len(buffers)} episodes")
@@ -499,15 +508,18 @@ def export_minari(args: Args) -> int:
 # Playing
 # ---------------------------------------------------------------------------------------------------------------------
 COUNTDOWN, BUSY_TIME = 3, 1.0  # s before a round, and until a page that was just loaded anew is free
+MAX_BEHIND = 1.0  # s of pictures that the browser has not drawn; beyond, nobody sees what is played
+SILENT = "The browser drew no picture for a second: this round is not kept."
 MAX_BODY = 16_384  # bytes that a browser may send at once
 NAMES = {"left", "right", "up", "down", "fire"}
 
 
 class Player:
-    """The browser at the other end: what it holds, and what it asked for."""
+    """The browser at the other end: what it holds, what it has drawn, and what it asked for."""
 
     def __init__(self, websocket):
         self.websocket, self.keys = websocket, Keys()
+        self.sent, self.drawn = 0, 0  # pictures, and the newest of them that is on the screen
         self.orders: asyncio.Queue[str] = asyncio.Queue()  # practice, record
         self.stopped, self.gone = False, False
 
@@ -526,7 +538,10 @@ class Player:
             self.orders.put_nowait("gone")
 
     def understand(self, message: dict) -> None:
-        """`{"held": [names], "axes": [x, y], "seq": n}` or `{"order": "practice" | "record" | "stop"}`."""
+        """`{"held": [names], "axes": [x, y], "seq": n}`, `{"drawn": n}` or `{"order": "practice" | "record" | "stop"}`."""
+        if "drawn" in message:
+            self.drawn = min(int(message["drawn"]), self.sent)
+            return
         if "order" in message:
             order = message["order"]
             if order == "stop":
@@ -541,8 +556,10 @@ class Player:
         self.keys = Keys(frozenset(message["held"]) & NAMES, (axes[0], axes[1]), int(message["seq"]) % 2**32)
 
     async def show(self, picture: bytes) -> None:
-        """Send a picture, with the number of the message whose keys it follows."""
-        await self.websocket.send_bytes(self.keys.seq.to_bytes(4, "little") + picture)
+        """Send a picture, with the number of the message whose keys it follows and its own."""
+        self.sent += 1
+        numbers = self.keys.seq.to_bytes(4, "little") + self.sent.to_bytes(4, "little")
+        await self.websocket.send_bytes(numbers + picture)
 
     async def tell(self, **message) -> None:
         await self.websocket.send_json(message)
@@ -560,7 +577,7 @@ class Clock:
 
 
 async def play_episode(game: Game, player: Player, seed: int) -> dict[str, np.ndarray] | None:
-    """Play one episode in real time; None where it was broken off.
+    """Play one episode in real time; None where it was broken off, or where the browser draws no more.
 
     Returns what `Recordings.add` writes: actions (T, ...), rewards (T,), t_ns (T,), terminated, truncated, seed, and
     observations (T + 1, ...), or for Atari lives (T,) and emulator_state.
@@ -577,7 +594,7 @@ async def play_episode(game: Game, player: Player, seed: int) -> dict[str, np.nd
     clock, begun = Clock(game.fps), time.perf_counter_ns()
     while True:
         await clock.tick()
-        if player.stopped:
+        if player.stopped or player.sent - player.drawn > MAX_BEHIND * game.fps:
             return None
         action = game.action(player.keys)
         columns["t_ns"].append(time.perf_counter_ns() - begun)
@@ -619,8 +636,9 @@ async def serve_player(websocket, game: Game, recordings: Recordings | None, see
                     if len(recordings.files) == before:  # else the round is kept, only the manifest lacks it
                         await player.tell(kind="over", score=None, recorded=False, trouble=first_line(error))
                         continue
+            silent = {"trouble": SILENT} if episode is None and not player.stopped else {}
             score = None if episode is None else float(episode["rewards"].sum())
-            await player.tell(kind="over", score=score, recorded=recorded and episode is not None)
+            await player.tell(kind="over", score=score, recorded=recorded and episode is not None, **silent)
     except WebSocketDisconnect:
         return
     except RuntimeError:  # it was lost while something was sent
@@ -711,6 +729,7 @@ def serve(app, listener: socket.socket, host: str) -> None:
     print(f"open http://{name}:{listener.getsockname()[1]} in a browser; Ctrl-C ends", flush=True)
     settings = {"log_level": "warning", "access_log": False, "server_header": False, "date_header": False}
     settings |= {"ws_max_size": MAX_BODY, "ws_per_message_deflate": False, "timeout_graceful_shutdown": 1}
+    settings |= {"ws_ping_interval": 5, "ws_ping_timeout": 5}  # s; a browser that is lost keeps others out for as long
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(uvicorn.Config(app, **settings)).run(sockets=[listener])
@@ -740,6 +759,8 @@ def main(args: Args) -> int:
     if not args.practice:
         make_folder(args.out)
         recordings = Recordings.open(args.out, about_recordings(args, game))
+        if recordings.torn:
+            recordings.write_manifest()
     serve(make_app(args, game, recordings), listener, args.host)
     if recordings is not None:
         print(f"{args.out}: {len(recordings.files)} episodes")

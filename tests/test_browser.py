@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import itertools
+import json
 import random
 import re
 import shutil
@@ -148,6 +149,20 @@ def test_a_round_whose_page_loses_focus_is_not_kept(tmp_path):
         page.wait_for_selector("#record:enabled", timeout=60_000)
     with np.load(tmp_path / "anna" / "episode_00000.npz", allow_pickle=False) as arrays:
         assert (arrays["actions"] == 4).all()  # the key that was down is not held any more
+
+
+def test_a_round_of_a_browser_that_fell_silent_is_not_kept(tmp_path):
+    """The connection holds, but nothing is drawn: the round is over a second after its beginning."""
+    process, address = start(RECORD, "--player", "anna", "--out", tmp_path / "anna", "--port", 0)
+    with websockets.sync.client.connect(address.replace("http", "ws") + "/play", origin=address) as socket:
+        socket.send('{"order": "record"}')
+        texts = (json.loads(text) for text in socket if isinstance(text, str))
+        times = {message["kind"]: (time.perf_counter(), message) for message in itertools.islice(texts, 6)}
+    assert list(times) == ["ready", "countdown", "go", "over"]  # of three countdowns the last
+    assert times["over"][1]["trouble"] == record.SILENT and times["over"][1]["recorded"] is False
+    assert 0.8 < times["over"][0] - times["go"][0] < 3
+    process.terminate()
+    assert process.wait(10) == 0 and not (tmp_path / "anna").exists()
 
 
 def test_a_message_that_is_too_large_ends_the_connection(tmp_path):

@@ -3,6 +3,7 @@
 import asyncio
 import itertools
 import json
+import math
 import types
 from pathlib import Path
 
@@ -38,6 +39,7 @@ def at_once(monkeypatch):
 
     monkeypatch.setattr(record.Clock, "tick", tick)
     monkeypatch.setattr(record, "COUNTDOWN", 0)
+    monkeypatch.setattr(record, "MAX_BEHIND", math.inf)  # pictures come faster than any browser draws
 
 
 class Browser:
@@ -256,6 +258,25 @@ def test_practice_and_what_is_broken_off_is_not_kept(at_once, tmp_path, monkeypa
     assert sorted(path.name for path in (tmp_path / "recordings").iterdir()) == ["episode_00000.npz", "manifest.json"]
 
 
+@pytest.mark.parametrize("drawn, kept", [(range(0, 1900, 8), True), (range(0, 600, 8), False), ([], False)])
+def test_a_round_that_nobody_sees_is_not_kept(drawn, kept, tmp_path, monkeypatch):
+    """Pictures are drawn to the end, for ten seconds or never: a second of 60 pictures later the round is over."""
+    monkeypatch.setattr(record, "COUNTDOWN", 0)
+    browser = Browser(make_args(folder=tmp_path / "anna"))
+
+    async def tick(clock) -> None:
+        await asyncio.sleep(0)
+        player.drawn = max((number for number in drawn if number <= player.sent), default=0)
+
+    async def send(content) -> None:
+        pass
+
+    monkeypatch.setattr(record.Clock, "tick", tick)
+    player = record.Player(types.SimpleNamespace(send_bytes=send, send_json=send))
+    episode = asyncio.run(record.play_episode(browser.game, player, 1))
+    assert (episode is not None) == kept and player.sent == (1801 if kept else max(drawn, default=0) + 61)
+
+
 def test_only_practice(at_once, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     browser = Browser(record.complete_args(record.Args(practice=True)))
@@ -325,7 +346,7 @@ def add(recordings: record.Recordings, seed: int) -> None:
     recordings.add({**columns, **times})
 
 
-def test_recordings_go_on_where_they_stopped(tmp_path, capsys):
+def test_recordings_go_on_where_they_stopped(tmp_path, monkeypatch):
     """A file that was written just before a crash, and is not in the manifest yet, is taken in."""
     args = make_args(folder=tmp_path / "anna")
     about = record.about_recordings(args, record.make_game(args))
@@ -334,7 +355,10 @@ def test_recordings_go_on_where_they_stopped(tmp_path, capsys):
         add(recordings, seed)
     edit_manifest(args.out, lambda manifest: manifest["files"].pop("episode_00002.npz"))
     again = record.Recordings.open(args.out, about)
-    assert again.files == recordings.files and again.scores == [0.0] * 3
+    assert again.files == recordings.files and again.scores == [0.0] * 3 and again.torn and not recordings.torn
+    monkeypatch.setattr(record, "serve", lambda *_: None)
+    assert record.cli(["--player", "anna", "--out", str(args.out), "--port", "0"]) == 0
+    assert json.loads((args.out / "manifest.json").read_text())["files"] == recordings.files
     add(again, 4)
     assert sorted(json.loads((args.out / "manifest.json").read_text())["files"]) == [
         f"episode_0000{i}.npz" for i in range(4)
@@ -395,6 +419,29 @@ def test_verify_reads_who_played(tmp_path, capsys):
     assert record.cli(["--out", str(args.out), "--verify"]) == 0
     assert "the same again" in capsys.readouterr().out
     assert_refused(record, capsys, ["--out", tmp_path, "--verify"], ["--out", "no recordings"])
+
+
+@pytest.mark.parametrize(
+    "env_id, options",
+    [(APPLE, None), (DRIVING, {"track": "hills", "brake": False}), (GOPHER, {"frame_skip": 4, "noop_max": 0})],
+)
+def test_other_players_recordings_are_played_as_they_were_recorded(env_id, options, tmp_path, capsys):
+    """Those of agents and of synthetic humans, which say their games' options if there are any."""
+    env, rng = record.make_game(record.Args(env_id=env_id), options).env, np.random.default_rng(1)
+    env.reset(seed=5)
+    driving = env_id == DRIVING
+    actions = np.float32([[0.01, 1]] * 150) if driving else rng.integers(env.action_space.n, size=20).repeat(20)
+    episode = {"actions": actions, "rewards": np.array([env.step(action)[1] for action in actions])}
+    about = {"env_id": env_id, "player": "synthetic human", **({} if options is None else {"options": options})}
+    record.Recordings(tmp_path / "demos", about).add({**episode, "seed": np.array(5)})
+    assert np.any(episode["rewards"] != 0)
+    assert record.cli(["--env-id", env_id, "--out", str(tmp_path / "demos"), "--verify"]) == 0
+    assert "the same again" in capsys.readouterr().out
+
+
+def test_options_of_another_game_are_refused(tmp_path, capsys):
+    record.Recordings(tmp_path, {"env_id": DRIVING, "player": "anna", "options": {"skip": 4}}).write_manifest()
+    assert_refused(record, capsys, ["--env-id", DRIVING, "--out", tmp_path, "--verify"], ["--out", "skip", DRIVING])
 
 
 def test_verify_finds_other_rewards(tmp_path, capsys):
