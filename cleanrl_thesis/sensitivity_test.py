@@ -14,7 +14,7 @@ own script is asked for episodes, or one of videos. All are drawn by the same re
 | double-blind | a clip's address is drawn at random for each participant; whose it is, is joined at `--export` alone | ours |
 | what is stored | age and gender if given, verdicts, comments; no name, address or time | ours |
 | an answer | is on disk when the page goes on; sent twice, it counts once and the first one stays | ours |
-| interval | 95%, bootstrap over participants, for each judges several clips; where all have the same share, Wilson's for so many participants | ours |
+| interval | 95%, Wilson's for the effective number of answers, for each participant judges several clips | ours |
 """
 
 # /// script
@@ -38,6 +38,7 @@ own script is asked for episodes, or one of videos. All are drawn by the same re
 # ///
 import contextlib
 import csv
+import fcntl
 import hashlib
 import importlib.util
 import io
@@ -89,7 +90,7 @@ class Args:
     seconds: float | None = None
     """length of a clip; default: 15, driving 30 (sections 2.4.1 to 2.4.3)"""
     seed: int = 1
-    """seed of the moments at which clips begin, and of the bootstrap"""
+    """seed of the moments at which clips begin"""
     clips_per_agent: int = 2
     """clips of each agent that a participant sees (sections 2.4.1 to 2.4.3)"""
     consent: Path | None = None
@@ -319,7 +320,7 @@ def find_episodes(folder: Path) -> Play:
         same = hashlib.sha256(path.read_bytes()).hexdigest() == checksum
         require(same, "--prepare", path, "its SHA-256 is not the manifest's, the file was changed or damaged")
         repeats = options.get("frame_skip", 4) if env_id.startswith("ALE/") else 1
-        lengths[path] = len(read_arrays(path)["actions"]) * repeats
+        lengths[path] = len(read_arrays(path)["actions"]) * repeats - (repeats - 1)  # the last may end sooner
     fps = 50 if env_id == "TorcsLike-v0" else 60
     return Play(env_id, fps, lengths, options)
 
@@ -565,6 +566,16 @@ def transaction(path: Path) -> Iterator[sqlite3.Connection]:
         db.execute("COMMIT")
 
 
+def lock_database(path: Path) -> None:
+    """Keep other servers, with other clips, out of a database as long as this process lives. Raises UsageError."""
+    try:
+        fcntl.flock(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UsageError(f"--db {path}: another study is running on it") from None
+    except OSError as error:
+        raise UsageError(f"--db {path}: cannot be written to: {error.strerror}") from None
+
+
 def open_database(path: Path, clips: list[Clip]) -> None:
     """Create the tables, or go on with those that are there. Raises UsageError."""
     try:
@@ -647,24 +658,25 @@ def clip_file(path: Path, address: str) -> str | None:
 # ---------------------------------------------------------------------------------------------------------------------
 # Export
 # ---------------------------------------------------------------------------------------------------------------------
-RESAMPLES, LEVEL = 10_000, 0.95
+QUANTILE = statistics.NormalDist().inv_cdf(0.975)
 
 
-def interval(human: np.ndarray, judged: np.ndarray, seed: int) -> tuple[float, float]:
-    """Interval of the share `human.sum() / judged.sum()`, counts of each participant (P,).
+def interval(human: np.ndarray, judged: np.ndarray) -> tuple[float, float]:
+    """95% interval of the share `human.sum() / judged.sum()`, counts of each participant (P,).
 
-    By bootstrap over participants. Where all of them have the same share, resamples are all alike: then Wilson's interval for
-    P participants.
+    Wilson's, for as many independent answers as tell as much: one person's are alike. By how much is measured at participants'
+    deviations from the share (the design effect), and is at least as if answers were independent, at most as if each
+    participant had given one. Where all answers are the same nothing can be measured: then the latter.
     """
-    tail, people = (1 - LEVEL) / 2, len(judged)
-    if np.ptp(human / judged) == 0:
-        share, z2 = human.sum() / judged.sum(), statistics.NormalDist().inv_cdf(1 - tail) ** 2 / people
-        middle, half = share + z2 / 2, math.sqrt(share * (1 - share) * z2 + z2 * z2 / 4)
-        return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
-    draws = np.random.default_rng(seed).integers(people, size=(RESAMPLES, people))
-    shares = human[draws].sum(1) / judged[draws].sum(1)
-    low, high = np.quantile(shares, (tail, 1 - tail))
-    return float(low), float(high)
+    answers, share = judged.sum(), human.sum() / judged.sum()
+    most = (judged**2).sum() / answers
+    effect = most
+    if len(judged) > 1 and 0 < share < 1:
+        variance = ((human - share * judged) ** 2).sum() * len(judged) / (len(judged) - 1) / answers**2
+        effect = np.clip(variance * answers / (share * (1 - share)), 1, most)
+    z2 = QUANTILE**2 * effect / answers
+    middle, half = share + z2 / 2, math.sqrt(share * (1 - share) * z2 + z2 * z2 / 4)
+    return max(0.0, float(middle - half) / (1 + z2)), min(1.0, float(middle + half) / (1 + z2))
 
 
 def guarded(text: object) -> str:
@@ -682,7 +694,7 @@ def write_csv(path: Path, rows: list[dict]) -> None:
     write_whole(path, content.getvalue().encode())
 
 
-def count_verdicts(answers: list[tuple], seed: int) -> list[dict]:
+def count_verdicts(answers: list[tuple]) -> list[dict]:
     """For each agent the column "Identified as Human", from answers (participant, agent, verdict, ...)."""
     rows = []
     for agent in sorted({answer[1] for answer in answers}):
@@ -691,7 +703,7 @@ def count_verdicts(answers: list[tuple], seed: int) -> list[dict]:
         human = np.array(
             [sum(who == p and name == agent and what == "human" for who, name, what, *_ in answers) for p in people]
         )
-        low, high = interval(human, judged, seed)
+        low, high = interval(human, judged)
         row = {"agent": guarded(agent), "identified_as_human": int(human.sum()), "judged": int(judged.sum())}
         row |= {"share": round(float(human.sum() / judged.sum()), 4), "low": round(low, 4), "high": round(high, 4)}
         rows.append({**row, "participants": len(people)})
@@ -711,7 +723,7 @@ def export(args: Args) -> int:
     except sqlite3.Error as error:
         raise UsageError(f"--db {args.db}: is no database of a study: {first_line(error)}") from None
     require(bool(answers), "--db", args.db, "holds no answers yet")
-    rows = count_verdicts(answers, args.seed)
+    rows = count_verdicts(answers)
     names = ("participant", "agent", "verdict", "position", "clip", "comment", "age", "gender")
     comments = [{name: guarded(value) for name, value in zip(names, answer)} for answer in answers]
     try:
@@ -862,7 +874,12 @@ def make_app(args: Args, clips: list[Clip]):
         sha256 = clip_file(args.db, address)
         if sha256 not in paths:
             raise HTTPException(404)
-        return video_response(paths[sha256].read_bytes(), request.headers.get("range"))
+        try:
+            content = paths[sha256].read_bytes()
+        except OSError as error:
+            print(f"error: --videos {paths[sha256]}: {error.strerror}", file=sys.stderr, flush=True)
+            raise HTTPException(503, "cannot be read") from None  # the page asks again until it can
+        return video_response(content, request.headers.get("range"))
 
     return app
 
@@ -903,6 +920,7 @@ def main(args: Args) -> int:
         return export(args)
     clips = find_clips(args.videos, args.clips_per_agent)
     app, listener = make_app(args, clips), listen(args.host, args.port)
+    lock_database(args.db)
     open_database(args.db, clips)
     serve(app, listener, args.host)
     return 0

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import itertools
 import json
+import math
 import os
 import random
 import shutil
@@ -403,28 +404,76 @@ def test_the_study_goes_on_with_its_clips(videos, capsys):
     assert_refused(study, capsys, flags, ["--db", "not a database"])
 
 
+def test_one_server_for_one_study(videos, capsys):
+    """A second one, with another clip, would draw it for participants of the first, which does not have it."""
+    db = videos.parent / "study.sqlite"
+    study.lock_database(db)
+    study.write_clip(videos / "human" / "003.mp4", pictures(77), 12)
+    assert_refused(study, capsys, ["--videos", videos, "--db", db, "--port", 0], ["--db", "another study is running"])
+    assert db.read_bytes() == b""
+
+
+def test_a_clip_that_is_gone_is_asked_for_again(videos, capsys):
+    client, _ = open_study(videos)
+    address = client.post("/join", json={"key": key_of(1)}).json()["address"]
+    for path in videos.glob("*/*.mp4"):
+        path.rename(path.with_suffix(".away"))
+    answer = client.get(f"/clip/{address}")
+    assert (answer.status_code, answer.json()) == (503, {"detail": "cannot be read"})
+    assert "No such file" in capsys.readouterr().err
+    for path in videos.glob("*/*.away"):
+        path.rename(path.with_suffix(".mp4"))
+    assert client.get(f"/clip/{address}").status_code == 200
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Export
 # ---------------------------------------------------------------------------------------------------------------------
-def test_interval_is_that_of_all_resamples():
-    """Three participants have 27 resamples; their quantiles are the interval, for 10,000 of them come near enough."""
-    human, judged = np.array([0, 1, 2]), np.array([2, 2, 1 + 1])
-    shares = [human[list(draw)].sum() / judged[list(draw)].sum() for draw in itertools.product(range(3), repeat=3)]
-    assert study.interval(human, judged, 1) == pytest.approx(np.quantile(shares, (0.025, 0.975), method="inverted_cdf"))
-    human = np.random.default_rng(0).binomial(2, 0.6, 26)
-    data = (human, np.full(26, 2))
-    theirs = scipy.stats.bootstrap(
-        data, lambda x, n, axis: x.sum(axis) / n.sum(axis), paired=True, method="percentile", n_resamples=10_000, rng=1
-    ).confidence_interval
-    assert study.interval(*data, 1) == pytest.approx((theirs.low, theirs.high), abs=0.02)
-
-
-@pytest.mark.parametrize("people, half", [(1, 0), (5, 0), (26, 0), (26, 1), (4, 1), (26, 2), (3, 2)])
-def test_interval_where_all_are_alike_is_wilsons(people, half):
-    """No one, everyone, or each once in two: the interval that so many participants would give with one answer each."""
+@pytest.mark.parametrize("people, share", [(1, 0), (5, 0), (26, 0), (26, 1), (3, 1)])
+def test_interval_of_one_and_the_same_answer_is_wilsons_for_the_participants(people, share):
     judged = np.full(people, 2)
-    expected = scipy.stats.binomtest(half * people // 2, people).proportion_ci(0.95, "wilson")
-    assert study.interval(np.full(people, half), judged, 1) == pytest.approx(tuple(expected), abs=1e-9)
+    expected = scipy.stats.binomtest(share * people, people).proportion_ci(0.95, "wilson")
+    assert study.interval(share * judged, judged) == pytest.approx(tuple(expected), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "human, judged, effective",
+    [
+        ([0, 2, 2, 0, 2], [2] * 5, 5),  # who says it once says it always: an answer each
+        ([1] * 8, [2] * 8, 16),  # each once: as if all were independent
+        ([0, 1, 0, 0, 1, 1], [1] * 6, 6),
+        ([3, 0, 1], [3, 1, 2], 6 / 1.75),  # by hand: squares of 14/9, times 3/2 / 36, to 2/9 / 6
+    ],
+)
+def test_interval_is_wilsons_for_the_effective_number_of_answers(human, judged, effective):
+    """Against the equation whose two roots are the interval's ends: (p - share)^2 = z^2 p (1 - p) / n."""
+    share = sum(human) / sum(judged)
+    for end in study.interval(np.array(human), np.array(judged)):
+        z2 = effective * (end - share) ** 2 / (end * (1 - end))
+        assert math.sqrt(z2) == pytest.approx(scipy.stats.norm.ppf(0.975), rel=1e-6)
+
+
+def test_the_design_effect_is_that_of_participants_shares():
+    """With as many clips for each, the variance is that of the mean of their shares, by SciPy."""
+    human, answers = np.random.default_rng(1).choice(3, p=(0.4, 0.3, 0.3), size=26), 52
+    share, error = human.sum() / answers, scipy.stats.sem(human / 2)
+    low, high = study.interval(human, np.full(26, 2))
+    z2 = (low - share) ** 2 / (low * (1 - low))
+    assert math.sqrt(z2 * share * (1 - share)) == pytest.approx(1.959964 * error, rel=1e-5)
+    assert 1 < error**2 * answers / (share * (1 - share)) < 2 and low < share < high
+
+
+@pytest.mark.parametrize("share", [0.02, 0.08, 0.3, 0.96])
+@pytest.mark.parametrize("alike", [0.0, 0.5])
+def test_intervals_hold_the_truth_19_times_in_20(share, alike):
+    """26 participants with two clips each, whose second answer repeats the first with a given probability."""
+    rng, held = np.random.default_rng(1), 0
+    for _ in range(2_000):
+        first, other = rng.random((2, 26)) < share
+        human = first + np.where(rng.random(26) < alike, first, other).astype(int)
+        low, high = study.interval(human, np.full(26, 2))
+        held += low <= share <= high
+    assert 0.935 < held / 2_000 < 0.985
 
 
 def test_export_counts_as_by_hand(videos, tmp_path, capsys):
