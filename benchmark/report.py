@@ -11,9 +11,10 @@ episode reward (NER) of a run is where its score lies between the least and the 
 those of the runs at hand.
 
 Intervals are 95% percentiles of a bootstrap stratified by task. Resamples of n seeds have (n - 1) / n of the variance that
-they should have, half with 2 seeds, so the deviations from a task's mean are stretched accordingly. Where a task has a single
-seed, tasks are resampled instead, which says nothing of other seeds. A claim is confirmed where the interval is above 0,
-contradicted where it is below, and open else, or where there is a single task.
+they should have, half with 2 seeds, so the deviations from a task's mean are stretched accordingly; and so few seeds give that
+variance uncertainly, so the interval is widened as Student's t is to the normal, by Welch's and Satterthwaite's degrees of
+freedom. Where a task has a single seed, tasks are resampled instead, which says nothing of other seeds. A claim is confirmed
+where the interval is above 0, contradicted where it is below, and open else, or where there is a single task.
 """
 
 import csv
@@ -31,6 +32,7 @@ from typing import NamedTuple
 import numpy as np
 from common import ROOT, UsageError, commit, commit_of, published_rows, run_main, write_csv
 from matplotlib.figure import Figure
+from scipy import stats
 
 METHODS = {"PPO": "PPO", "stop": "KLE-Stop", "rollback": "KLE-Rollback"}
 COLOURS = {"PPO": "tab:blue", "stop": "tab:orange", "rollback": "tab:green"}
@@ -253,27 +255,38 @@ def interquartile_mean(scores: Scores) -> np.ndarray:
     return values[..., cut : values.shape[-1] - cut].mean(-1)
 
 
-def resample(scores: Scores, rng: np.random.Generator, stretches: bool = True) -> Scores:
+def resample(scores: Scores, rng: np.random.Generator) -> Scores:
     """RESAMPLES times as many runs, drawn with replacement within each task: (seeds,) -> (RESAMPLES, seeds).
 
-    Stretched, their means have the variance of means of so many seeds.
+    Their means have the variance of means of so many seeds.
     """
     drawn = {}
     for task, values in scores.items():
         n = len(values)
-        factor = np.sqrt(n / (n - 1)) if stretches and n > 1 else 1.0
+        factor = np.sqrt(n / (n - 1)) if n > 1 else 1.0
         drawn[task] = values.mean() + factor * (values[rng.integers(n, size=(RESAMPLES, n))] - values.mean())
     return drawn
 
 
-def bootstrap(
-    statistic: Callable[..., np.ndarray], *groups: Scores, stretches: bool = True
-) -> tuple[float, float, float]:
-    """A statistic of groups of runs, and its 95% percentile interval by a bootstrap stratified by task."""
-    rng = np.random.default_rng(0)
-    drawn = statistic(*(resample(group, rng, stretches) for group in groups))
-    low, high = np.percentile(drawn, (2.5, 97.5))
-    return float(statistic(*groups)), float(low), float(high)
+def freedom(*groups: Scores) -> float:
+    """Degrees of freedom of a sum of the tasks' means (Welch 1947, Satterthwaite 1946); infinite where runs do not differ."""
+    runs = [values for group in groups for values in group.values() if len(values) > 1]
+    variances = np.array([values.var(ddof=1) / len(values) for values in runs])
+    squares = sum(variance**2 / (len(values) - 1) for variance, values in zip(variances, runs))
+    return float(variances.sum() ** 2 / squares) if squares > 0 else np.inf
+
+
+def widening(degrees: float) -> float:
+    """By how much Student's 95% interval is wider than the normal one."""
+    return float(stats.t.ppf(0.975, degrees) / stats.norm.ppf(0.975))
+
+
+def bootstrap(statistic: Callable[..., np.ndarray], *groups: Scores) -> tuple[float, float, float]:
+    """A statistic of groups of runs, and its 95% interval by a bootstrap stratified by task."""
+    rng, middle = np.random.default_rng(0), float(statistic(*groups))
+    drawn = statistic(*(resample(group, rng) for group in groups))
+    ends = middle + widening(freedom(*groups)) * (np.percentile(drawn, (2.5, 97.5)) - middle)
+    return middle, float(ends[0]), float(ends[1])
 
 
 def bootstrap_tasks(statistic: Callable[..., np.ndarray], *groups: Scores) -> tuple[float, float, float]:
@@ -283,7 +296,7 @@ def bootstrap_tasks(statistic: Callable[..., np.ndarray], *groups: Scores) -> tu
     drawn = []
     for chosen in rng.integers(number, size=(RESAMPLES, number)):
         drawn.append(float(statistic(*({i: group[tasks[k]] for i, k in enumerate(chosen)} for group in groups))))
-    stretch = np.sqrt(number / max(1, number - 1))
+    stretch = np.sqrt(number / max(1, number - 1)) * widening(max(1, number - 1))
     low, high = middle + stretch * (np.percentile(drawn, (2.5, 97.5)) - middle)
     return middle, float(low), float(high)
 
