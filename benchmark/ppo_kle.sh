@@ -6,15 +6,28 @@
 #   STAGES="K10 K80" benchmark/ppo_kle.sh                                        72 of these to 2,000,000 steps
 #   STAGES="K10 K80" START_SEED=5 NUM_SEEDS=1 benchmark/ppo_kle.sh               the same of seed 5, 36 runs
 #   STAGES=cost STOP_AT=100000 WORKERS=1 RUNS=runs/ppo_kle_cost benchmark/ppo_kle.sh  22 short runs that time each task
+#   SETTING=printed STAGES=first STOP_AT=500000 benchmark/ppo_kle.sh             Table 4.1 and section 4.3.2 to the letter
+#   SETTING=modern STAGES=first STOP_AT=500000 benchmark/ppo_kle.sh              recommended for new work; both into folders of their own
 #   WORKERS=200 SLURM=benchmark/slurm_template.sh benchmark/ppo_kle.sh           on a cluster, 200 runs at a time
 set -euo pipefail
 cd "$(dirname "$0")/.."
-STAGES=${STAGES:-all} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/ppo_kle}
+STAGES=${STAGES:-all} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} SETTING=${SETTING:-as-run}
+exact="--kl-timing after-iteration --kl-estimator"
+case $SETTING in  # by the table of ppo_continuous_kle.py; K and how to stop are the stage's
+  as-run) flags= RUNS=${RUNS:-runs/ppo_kle} ;;
+  printed) flags="--gae-lambda 0.97 --ent-coef 0.2 --init-gains 1 1 1 --value-learning-rate 3e-4 --norm-adv-scope batch --norm-divisor variance $exact exact-new-old --rollback policy" ;;
+  modern) flags="--bootstrap-truncated $exact exact-old-new --kl-samples batch --rollback policy-moments" ;;
+  *)
+    echo "SETTING=$SETTING: must be as-run, printed or modern" >&2
+    exit 2
+    ;;
+esac
+RUNS=${RUNS:-runs/ppo_kle_$SETTING}
 START_SEED=${START_SEED:-1} NUM_SEEDS=${NUM_SEEDS:-2}  # of K10 and K80
 SIX=(kle/{HalfCheetah,Hopper,Walker2d,Swimmer,Reacher,InvertedPendulum}-v2)
 FIVE=(kle/{Ant,Humanoid,Pusher,Striker,Thrower}-v2)
 sweep() {  # name of the stage, then what differs
-  "$PYTHON" benchmark/sweep.py --command "$PYTHON cleanrl_thesis/ppo_continuous_kle.py --compile --checkpoint-interval 200000" \
+  "$PYTHON" benchmark/sweep.py --command "$PYTHON cleanrl_thesis/ppo_continuous_kle.py --compile --checkpoint-interval 200000 $flags" \
     --runs "$RUNS" --workers "$WORKERS" ${STOP_AT:+--stop-at "$STOP_AT"} ${SLURM:+--slurm-template-path "$SLURM"} --name "$@"
 }
 both() { for target in "$@"; do echo "kle-stop,d-target=$target" "kle-rollback,d-target=$target"; done; }

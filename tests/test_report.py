@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -15,6 +16,8 @@ from scipy import stats
 
 sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
 from common import UsageError  # noqa: E402
+
+from cleanrl_thesis import ppo_continuous_kle as ppo  # noqa: E402
 
 report = importlib.import_module("report")
 
@@ -385,3 +388,14 @@ def test_a_single_task_leaves_a_claim_open():
     """Seeds of one task say nothing of others."""
     found = report.tell("", "", report.minus, {"Hopper": np.array([1.0, 0.9])}, {"Hopper": np.array([0.5, 0.4])})
     assert (found.measured, found.verdict) == ("+0.50, 1 task, 2 seeds", "open")
+
+
+@pytest.mark.parametrize("setting, stages", [("printed", set()), ("modern", {"--kle-rollback", "--update-epochs 80"})])
+def test_the_study_runs_the_settings_of_the_file(setting, stages):
+    """Flags of `SETTING=... benchmark/ppo_kle.sh` are those of the file's table, but for what its stages differ in."""
+    command = ["env", f"SETTING={setting}", "STAGES=first", "PYTHON=echo", ROOT / "benchmark" / "ppo_kle.sh"]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    line = next(line for line in ppo.__doc__.splitlines() if line.startswith(("| as " + setting, "| " + setting)))
+    flags = {*re.split(r" (?=--)", line.split("`")[1])}
+    used = re.search(r"--checkpoint-interval 200000 (.*) --runs ", told)[1]
+    assert {*re.split(r" (?=--)", used)} == flags - stages and f"--runs runs/ppo_kle_{setting} " in told
