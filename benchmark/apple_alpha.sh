@@ -8,17 +8,22 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
-FEWER_SEEDS=${FEWER_SEEDS:-$(echo $SEEDS | cut -d " " -f 1-3)}
 ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
 OTHER_ALPHAS=${OTHER_ALPHAS:-0.93 1.0 0.5 0.7 0.8 0.3 0.9}
 . benchmark/sweep_lines.sh  # sweep
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
   echo "teacher_seed$seed --seed $seed"
-done | sweep teachers cleanrl_thesis/dqn_apple.py --compile --save-model
+done | sweep teachers cleanrl_thesis/dqn_apple.py --compile --save-model || code=$?
+[ "$code" -le 1 ] || exit "$code"
+ready= missing=
 for seed in $SEEDS; do
-  [ -e "$RUNS/teacher_seed$seed/result.json" ] || { echo "the students wait for $RUNS/teacher_seed$seed"; exit; }
+  if [ -e "$RUNS/teacher_seed$seed/result.json" ]; then ready="$ready $seed"; else missing="$missing $RUNS/teacher_seed$seed"; fi
 done
+[ -z "$missing" ] || echo "students wait for$missing"
+if [ -z "$ready" ] || { [ -n "${SLURM:-}" ] && [ -n "$missing" ]; }; then exit "$code"; fi  # an array is queued once, for all
+SEEDS=${ready# }
+FEWER_SEEDS=${FEWER_SEEDS:-$(echo $SEEDS | cut -d " " -f 1-3)}
 for seed in $SEEDS; do
   demos="$RUNS/quick_demos_seed$seed"
   [ -e "$demos/manifest.json" ] || "$PYTHON" benchmark/apple_players.py --seed "$seed" --demos "$demos"

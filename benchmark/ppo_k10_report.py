@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import UsageError, finished_runs, run_main, write_csv
+from common import UsageError, commit, commit_of, finished_runs, run_main, write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -47,6 +47,7 @@ def read_runs(folder: Path) -> list[dict]:
                 "greedy_evaluation": round(result["evaluation"]["mean"], 2),
                 "training_seconds": round(result["training_seconds"]),
                 "folder": run.name,
+                "script_sha256": result["script_sha256"][:12],
             }
         )
     return rows
@@ -116,6 +117,16 @@ def ppo_k10_figure(published: list[dict], runs: list[dict], folder: Path) -> Fig
     return figure
 
 
+def provenance(runs: list[dict]) -> str:
+    """What the results rest on."""
+    made_at = sorted({commit_of("ppo_continuous_kle", run["script_sha256"]) for run in runs})
+    hours = sum(run["training_seconds"] for run in runs) / 3600
+    return (
+        f"`benchmark/ppo_k10.sh`, ppo_continuous_kle.py at {', '.join(made_at)}; `python benchmark/ppo_k10_report.py` at "
+        f"{commit()}. {len(runs)} runs, {hours:.1f} core-hours of training.\n\n"
+    )
+
+
 def main(args: Args) -> None:
     published, runs = read_csv(BENCHMARK / "published" / "ppo_k10_seeds.csv"), read_runs(args.runs)
     if not runs:
@@ -123,8 +134,7 @@ def main(args: Args) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "runs.csv", runs)
     table = ppo_k10_table(published, runs)
-    hours = sum(run["training_seconds"] for run in runs) / 3600
-    (args.out / "table.md").write_text(f"{len(runs)} runs, {hours:.1f} core-hours of training.\n\n{table}")
+    (args.out / "table.md").write_text(provenance(runs) + table)
     ppo_k10_figure(published, runs, args.runs).savefig(args.out / "learning_curves.png", dpi=110)
     print(table)
 

@@ -1,9 +1,11 @@
 """The report's numbers against scipy and by hand, and the timing tool's table."""
 
 import csv
+import hashlib
 import importlib
 import json
 import math
+import re
 import sys
 
 import numpy as np
@@ -36,6 +38,7 @@ def fake_run(folder, task: str, seed: int, returns: list[float], complete: bool 
         "global_step": 1000 * len(returns),
         "training_seconds": 3600.0,
         "complete": complete,
+        "script_sha256": hashlib.sha256((ROOT / "cleanrl_thesis" / "ppo_continuous_kle.py").read_bytes()).hexdigest(),
     }
     (run / "result.json").write_text(json.dumps({**result, "evaluation": {"mean": 1.0}}))
 
@@ -55,7 +58,8 @@ def test_report_of_part_of_the_runs(tmp_path):
     )
     assert [float(row["last_episode"]) for row in rows] == pytest.approx([returns[s][-1] for s in (1, 2)], abs=0.01)
     text = (tmp_path / "out" / "table.md").read_text()
-    assert text.startswith("2 runs, 2.0 core-hours") and "| HalfCheetah-v2 | last episode | 1,804, 1,448 |" in text
+    assert "2 runs, 2.0 core-hours" in text and "| HalfCheetah-v2 | last episode | 1,804, 1,448 |" in text
+    assert re.match(r"`benchmark/ppo_k10.sh`, ppo_continuous_kle.py at (\w+|not recorded); .* at \w+", text)
     assert "| Hopper-v2 | last episode | 3,609, 1,276 | not done |" in text
     assert (tmp_path / "out" / "learning_curves.png").read_bytes()[:4] == b"\x89PNG"
 

@@ -451,13 +451,22 @@ def test_a_study_that_cannot_be_sends_nothing(script, settings, words, tmp_path)
     assert not (tmp_path / "calls").exists() and not (tmp_path / "runs").exists()
 
 
-def test_students_of_a_driver_need_the_first_expert_alone(tmp_path):
-    fails = 'if "expert_seed2" in " ".join(sys.argv):\n    sys.exit(1)\n'
+@pytest.mark.parametrize(
+    "script, failed, settings, number, report",
+    [
+        ("torcs_alpha.sh", "expert_seed2", {}, 2 + 3 * (3 + 11 + 4) + 2 * 3, "torcs_report.py"),
+        ("apple_alpha.sh", "teacher_seed2", {"SEEDS": "1 2"}, 2 + 12 + 7 + 1 + 12 + 3 + 2 + 4 * 7, "apple_report.py"),
+    ],
+)
+def test_a_failed_expert_keeps_its_own_students_alone(script, failed, settings, number, report, tmp_path):
+    """The driving task's are all of the first expert; in the Apple game each seed has its own."""
+    fails = f'if "{failed} " in " ".join(sys.argv) + " " and "--teacher" not in sys.argv:\n    sys.exit(1)\n'
     stand_in = STAND_IN.replace('if "--run-dir"', fails + 'if "--run-dir"')
     with pytest.raises(subprocess.CalledProcessError) as error:
-        study("torcs_alpha.sh", tmp_path, stand_in=stand_in)
+        study(script, tmp_path, stand_in=stand_in, **settings)
     calls = [json.loads(line) for line in (tmp_path / "calls").read_text().splitlines()]
-    assert error.value.returncode == 1 and calls[-1][0] == "benchmark/torcs_report.py"
+    runs = {" ".join(words) for words in calls if words[0].startswith("cleanrl_thesis/")}
+    assert error.value.returncode == 1 and calls[-1][0] == f"benchmark/{report}" and len(runs) == number
 
 
 def test_a_study_runs_in_a_folder_with_a_blank(tmp_path):
