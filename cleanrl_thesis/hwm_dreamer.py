@@ -16,7 +16,7 @@ only where a segment begins, w_t with each step. Actor and critic see both, and 
 | v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all (`--classes 1`: normal) |
 | Z and W | half of S each | `xs`: 4 and 20 of 24 variables, `s`: 8 and 40 of 48, for y has to show each frame between two reads (not compared with halves yet) |
 | boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; where the agents read in the end means little (`benchmark/results/README.md`) |
-| the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.7); no read or copy is forced within an episode |
+| the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.1); no read or copy is forced within an episode |
 | faithful model | | `--size thesis --kl-z-scale 1 --kl-w-scale 1 --kl-m-scale 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0` |
 | Eq. 3.3.8, 3.3.9 | sums over a dream | means, each step weighed by how likely the dream comes to it, and by its discount |
 | acting | not said | m from p(m), z from q where it is read, w from q |
@@ -198,6 +198,8 @@ class Args:
     """w starts anew from z where z is read (VTA)"""
     c_sees_w: bool = True
     """c_t is made from w_{t-1} and a_{t-1} too (Eq. 3.3.1), not only from z_{t-1}"""
+    h_sees_z: bool = True
+    """h_t is made from z_t too (Eq. 3.3.1), not only from w_{t-1} and a_{t-1} (section 3.3.2)"""
     decoder_sees_h: bool = True
     """the decoder sees h_t too (Eq. 3.3.1), not only y_t and z_t"""
     decoder_sees_c: bool = True
@@ -994,7 +996,7 @@ class HWM(nn.Module):
 
     def low_level(self, state: Belief, z: torch.Tensor, previous_action, read) -> torch.Tensor:
         """h_t (B, deter_w) from w_{t-1}, a_{t-1} and z_t; with `--w-reset` from z_t alone where z was read."""
-        h = self.w_rnn(torch.cat([state.y, previous_action, z], -1), state.h)
+        h = self.w_rnn(torch.cat([state.y, previous_action, z * self.args.h_sees_z], -1), state.h)
         return read * torch.tanh(self.w_start(z)) + (1 - read) * h if self.args.w_reset else h
 
     def high_level(self, state: Belief, previous_action) -> torch.Tensor:
@@ -1130,7 +1132,9 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     later = (read[1:] * follows).sum()
     parts |= {"read_rate": later / follows.sum().clamp(min=1), "segment_length": follows.sum() / later.clamp(min=1)}
     spread = ((torch.sigmoid(made.q_m[:-1]) - read_rate).square() * settled).sum() / settled.sum().clamp(min=1)
+    agreement = ((made.p_m > 0) == (made.q_m[:-1] > 0)).float()
     parts |= {"read_spread": spread.sqrt()}  # 0: q(m) is the same everywhere
+    parts |= {"agreement": (agreement * decides).sum() / decides.sum().clamp(min=1)}
     return loss, made.belief, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
 

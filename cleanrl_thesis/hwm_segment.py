@@ -12,12 +12,13 @@ be sent again after every crash: on the same machine the run ends with the same 
 |---|---|---|
 | v_t on COPY | not said | copied, as in VTA: drawn anew each step it would make z a fast variable |
 | q(z_t), q(w_t) | mean field | q(v_t given c_t, o_t), used where z is read; q(y_t given h_t, z_t, o_t) |
+| h_t | by Eq. 3.3.1 from z_t too, by its rule in section 3.3.2 not | from z_t too, the only way from z to w; `--no-h-sees-z`: not |
 | q(m given O) | temporal convolution | three layers of width 3 and a linear one, which end at the borders of an episode |
 | KL terms | weight 1 | z and w 0.1, balanced 0.8 as in Dreamer; m on its own scale |
 | `--w-reset` | no | yes: w starts anew from z where z is read (VTA) |
 | `--narrow-w`, `--no-decoder-sees-h`, `--no-decoder-sees-c` | no | yes: the decoder sees v and 4 noisy numbers of w in ±1, else w alone carries all and nothing holds a segment |
 | `--budget` | no | the share of steps that may be read, annealed from all; more costs `--budget-price` each |
-| forced reads and copies | no | in training a read after 20 steps without (`--max-segment-length`), and with `--max-segments` copies after so many (VTA) |
+| forced reads and copies | no | in training a read after 20 steps without (`--max-segment-length`), and with `--max-segments` copies after so many (VTA); KL_m leaves these steps out, VTA trains q there |
 | KL_z prices reads | yes | no (`--detach-kl-z`, VTA) |
 
 The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 but for forced reads and copies and the
@@ -178,6 +179,8 @@ class Args:
     """that noise's standard deviation (ours)"""
     c_sees_w: bool = True
     """c_t is made from w_{t-1} and a_{t-1} too (Eq. 3.3.1), not only from z_{t-1} (VTA)"""
+    h_sees_z: bool = True
+    """h_t is made from z_t too (Eq. 3.3.1), not only from w_{t-1} and a_{t-1} (section 3.3.2)"""
     decoder_sees_h: bool = False
     """the decoder sees h_t too (Eq. 3.3.1), not only y_t and z_t"""
     decoder_sees_c: bool = False
@@ -586,7 +589,7 @@ class HWM(nn.Module):
             v = begins * v + (1 - begins) * self.prior_z(updated).mean
         v = read * v + (1 - read) * state.v
         z = torch.cat([c, v], -1)
-        h = self.w_rnn(torch.cat([state.y, previous_action, z], -1), state.h)
+        h = self.w_rnn(torch.cat([state.y, previous_action, z * self.args.h_sees_z], -1), state.h)
         if self.args.w_reset:
             h = read * torch.tanh(self.w_start(z)) + (1 - read) * h
         q_w = self.low_level(self.posterior_w, torch.cat([h, z, embed], -1))
@@ -679,6 +682,7 @@ def hwm_loss(
     terms = {"reconstruction": reconstruction, "kl_z": kl_z, "kl_w": kl_w, "kl_m": kl_m, "read_rate": read_rate}
     agreement = ((made.p_m > 0) == (made.q_m > 0)).float()
     terms["agreement"] = (agreement * decides).sum() / decides.sum().clamp(min=1)
+    terms["segment_length"] = made.reads.numel() / made.reads.sum()
     return loss, {name: value.detach().mean() for name, value in terms.items()}
 
 

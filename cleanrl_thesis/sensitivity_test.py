@@ -906,6 +906,7 @@ def serve(app, listener: socket.socket, host: str) -> None:
     print(f"open http://{name}:{listener.getsockname()[1]} in a browser; Ctrl-C ends", flush=True)
     settings = {"log_level": "warning", "access_log": False, "server_header": False, "date_header": False}
     settings |= {"ws_max_size": MAX_BODY, "ws_per_message_deflate": False, "timeout_graceful_shutdown": 1}
+    settings |= {"ws_ping_interval": 5, "ws_ping_timeout": 5}  # s; a browser that is lost keeps others out for as long
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(uvicorn.Config(app, **settings)).run(sockets=[listener])

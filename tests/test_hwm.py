@@ -287,7 +287,13 @@ def test_the_gradient_is_clipped_by_its_norm():
         *({"image_scale": 1.0}, {"kl_z_scale": 1.0}, {"kl_w_scale": 1.0}, {"kl_m_scale": 1.0}, {"kl_balance": 0.5}),
         *({"detach_kl_z": False}, {"temperature": 0.5}, {"boundary_bound": 3.0}, {"read_bias": 1.0}, {"budget": 1.0}),
         *({"max_segment_length": 1}, {"max_segments": 1}, {"w_reset": False}, {"narrow_w": False}, {"narrow_std": 0.2}),
-        *({"c_sees_w": False}, {"decoder_sees_h": True}, {"decoder_sees_c": True}, {"read_price": 1.0}),
+        *(
+            {"c_sees_w": False},
+            {"h_sees_z": False},
+            {"decoder_sees_h": True},
+            {"decoder_sees_c": True},
+            {"read_price": 1.0},
+        ),
         *({"budget_price": 1.0}, {"budget_updates": 15}, {"surprise_price": 1.0}, {"foretell_copies": 0.1}),
     ],
     ids=str,
@@ -485,6 +491,24 @@ def test_c_is_made_from_w_and_the_action_where_it_sees_them(sees):
         other = state._replace(**{part: torch.randn_like(getattr(state, part))})
         assert torch.equal(c(other, [0, 1]), plain) != sees, part
     assert not torch.equal(c(state._replace(v=state.v + 1), [0, 1]), plain)
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_h_is_made_from_z_where_it_sees_it(sees):
+    """On a copy, where nothing but z differs."""
+    model = make_model(h_sees_z=sees, w_reset=False)
+    state = method.Belief(*(torch.randn(2, SIZES[name]) for name in ("deter_z", "stoch_z", "deter_w", "stoch_w")))
+    zero, embed = torch.zeros(2, 1), torch.randn(2, model.args.hidden_size)
+    noise = [torch.zeros(2, SIZES[name]) for name in ("stoch_z", "stoch_w")]
+    action = torch.nn.functional.one_hot(torch.tensor([0, 1]), 3).float()
+
+    def h(state):
+        return model.step(state, action, zero, zero, embed, noise, False)[0].h
+
+    plain = h(state)
+    for part in ("c", "v"):
+        assert torch.equal(h(state._replace(**{part: getattr(state, part) + 1})), plain) != sees, part
+    assert not torch.equal(h(state._replace(y=state.y + 1)), plain)
 
 
 @pytest.mark.parametrize("part", ["c", "h"])

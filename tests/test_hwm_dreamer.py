@@ -278,8 +278,15 @@ def test_each_gradient_is_clipped_by_its_own_norm():
 
 HWM_FLAGS = [
     *({"kl_z_scale": 0.5}, {"kl_w_scale": 0.5}, {"kl_m_scale": 1.0}, {"detach_kl_z": False}, {"temperature": 0.5}),
-    *({"boundary_bound": 3.0}, {"read_bias": 1.0}, {"w_reset": True}, {"c_sees_w": False}, {"decoder_sees_h": False}),
-    *({"decoder_sees_c": False}, {"budget": 1.0}, {"budget_price": 1.0}, {"budget_updates": 20}, {"fixed_interval": 2}),
+    *({"boundary_bound": 3.0}, {"read_bias": 1.0}, {"w_reset": True}, {"c_sees_w": False}, {"h_sees_z": False}),
+    *(
+        {"decoder_sees_h": False},
+        {"decoder_sees_c": False},
+        {"budget": 1.0},
+        {"budget_price": 1.0},
+        {"budget_updates": 20},
+        {"fixed_interval": 2},
+    ),
 ]
 
 
