@@ -22,6 +22,7 @@ from scipy import stats
 
 RUNGS = {
     "faithful": "(a) Eq. 3.3.1 to 3.3.7",
+    "literal": "(a) all weights 1, nothing forced",
     "kl_w": "(b) KL_w ten times",
     "reset": "(c) w reset where z is read",
     "price": "(d) a price for each read",
@@ -69,14 +70,17 @@ def read_runs(folder: Path) -> list[dict]:
         best = {
             key: max(floor[key] for name, floor in segmentation["floors"].items() if re.fullmatch(IGNORANT, name))
             for key in MEASURES
-            if key.startswith("f1")
+            if key.startswith(("f1", "area"))
         }
+        best["reconstruction_mse"] = segmentation["mse_of_the_mean_frame"]
         about = {"rung": re.sub(r"_seed\d+$", "", run.name), "seed": result["seed"], "run": run.name}
         about |= {"script_sha256": result["script_sha256"], "training_seconds": result["training_seconds"]}
         for mode in ("prior", "sampled", "posterior"):
             made = segmentation[mode]
             row = {**about, "m": mode, **{key: made[key] for key in MEASURES}}
             row |= {f"{what}_from_{level}": value[level] for what, value in made["probes"].items() for level in "zw"}
+            row |= {f"most_frequent_{what}": value["most frequent"] for what, value in made["probes"].items()}
+            best["mutual_information_z_room"] = made["mutual_information_by_chance"]
             rows.append(row | {f"best_floor_{key}": value for key, value in best.items()})
     return rows
 
@@ -90,17 +94,22 @@ def read_known(folder: Path, rows: list[dict]) -> list[dict]:
         raise UsageError(f"--known {folder}: runs.csv cannot be read: {error.strerror}") from None
     runs, words = {row["run"] for row in rows}, {"rung", "run", "script_sha256", "m"}
     return [
-        {key: value if key in words else float(value) for key, value in row.items()} | {"seed": int(row["seed"])}
+        {key: value if key in words else float(value or "nan") for key, value in row.items()}
+        | {"seed": int(row["seed"])}
         for row in known
         if row["run"] not in runs
     ]
 
 
+def mean_of_measured(rows: list[dict], key: str) -> str:
+    """The mean over the rows that have a measure; nothing where none has it."""
+    measured = [row[key] for row in rows if not math.isnan(row.get(key, math.nan))]
+    return f"{np.mean(measured):.{5 if key.endswith('mse') else 2}f}" if measured else ""
+
+
 def best_floors(rows: list[dict], measures: Iterable[str]) -> list[str]:
-    """The mean of each F1's best floor, over the rows that have it."""
-    columns = [[row.get(f"best_floor_{key}", math.nan) for row in rows] for key in measures]
-    measured = [[value for value in column if not math.isnan(value)] for column in columns]
-    return [f"{np.mean(column):.2f}" if column else "" for column in measured]
+    """The mean of each measure's best floor, over the rows that have it."""
+    return [mean_of_measured(rows, f"best_floor_{key}") for key in measures]
 
 
 def interval(values: list[float]) -> str:
@@ -138,7 +147,7 @@ def rung_table(rows: list[dict]) -> list[str]:
             if not group:
                 continue
             cells = [interval([row[key] for row in group]) for key in MEASURES if key != "reconstruction_mse"]
-            cells.append(f"{np.mean([row['reconstruction_mse'] for row in group]):.5f}")
+            cells.append(mean_of_measured(group, "reconstruction_mse"))
             minutes = np.mean([row["training_seconds"] for row in group]) / 60
             cells += [*above_floors(group), f"{minutes:.1f}"]
             lines.append(f"| {title} | {m} | {len(group)} | {' | '.join(cells)} |")
@@ -155,7 +164,8 @@ def probe_table(rows: list[dict]) -> list[str]:
         if group:
             pairs = [[np.mean([row[f"{kind}_from_{level}"] for row in group]) for level in "zw"] for kind in kinds]
             lines.append(f"| {title} | {' | '.join(f'{z:.2f}, {w:.2f}' for z, w in pairs)} |")
-    return lines
+    floors = [mean_of_measured(rows, f"most_frequent_{kind}") for kind in kinds]
+    return [*lines, f"| the most frequent one | {' | '.join(floors)} |"]
 
 
 def write_report(rows: list[dict], runs: Path, out: Path) -> None:
@@ -180,6 +190,8 @@ def main(args: Args) -> None:
     found = read_runs(args.runs)
     if args.known is not None:
         found = read_known(args.known, found) + found
+    columns = dict.fromkeys(key for row in found for key in row)
+    found = [{key: row.get(key, math.nan) for key in columns} for row in found]
     if not found:
         raise UsageError(f"--runs {args.runs}: holds no finished run")
     write_report(found, args.runs, args.out)

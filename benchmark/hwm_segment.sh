@@ -7,7 +7,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
-RUNGS=${RUNGS:-narrow surprise faithful reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
+RUNGS=${RUNGS:-narrow surprise faithful literal reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
 . benchmark/sweep_lines.sh  # sweep
 # rung (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of it
 FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
@@ -22,6 +22,10 @@ lines=$(
         flags="--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --foretell-copies 0.1 --total-updates 5000 --budget-updates 3200 --compile"
         ;;
       faithful) flags="$FAITHFUL" ;;
+      literal)                                           # (a) with all weights 1 and nothing forced; balanced halves are one KL
+        flags="$FAITHFUL --kl-z-scale 2 --kl-w-scale 2 --kl-m-scale 2 --kl-balance 0.5 --image-scale 1 --red-scale 1"
+        flags+=" --max-segment-length 0 --max-segments 0"
+        ;;
       kl_w) flags="$FAITHFUL --kl-w-scale 1" ;;          # (b) a larger weight of KL_w
       reset) flags="$FAITHFUL --w-reset" ;;              # (c) w starts anew where z is read
       price) flags="$FAITHFUL --read-price 10" ;;        # (d) a price for each read
@@ -31,7 +35,7 @@ lines=$(
         flags+=" --batch-size 8 --max-segment-length 0"
         ;;
       *)
-        echo "RUNGS=$RUNGS: must be of surprise, narrow, no_budget, faithful, kl_w, reset, price and wander" >&2
+        echo "RUNGS=$RUNGS: must be of surprise, narrow, no_budget, faithful, literal, kl_w, reset, price and wander" >&2
         exit 2
         ;;
     esac

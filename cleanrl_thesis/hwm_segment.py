@@ -1011,6 +1011,23 @@ def boundary_scores(found: list[np.ndarray], rooms: list[np.ndarray]) -> dict[st
     return scores
 
 
+def area_under_curve(scores: np.ndarray, true: np.ndarray) -> float:
+    """Probability that a boundary has a higher score than another step; ties count half."""
+    _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - (counts - 1) / 2)[inverse]
+    positives = int(true.sum())
+    if positives in (0, len(true)):
+        return math.nan
+    return float((ranks[true].sum() - positives * (positives + 1) / 2) / (positives * (len(true) - positives)))
+
+
+def curve_areas(scores: np.ndarray, rooms: list[np.ndarray]) -> dict[str, float]:
+    """The same for the boundaries of both labellings, from scores of all episodes' steps, one after the other."""
+    labels = {"8_labels": rooms, "4_rooms": [merge_doors(each) for each in rooms]}
+    true = {name: np.concatenate([part[1:] != part[:-1] for part in each]) for name, each in labels.items()}
+    return {f"area_under_curve_{name}": area_under_curve(scores, each) for name, each in true.items()}
+
+
 def floors(rooms: list[np.ndarray], states: list[np.ndarray], read_rate: float, rng: np.random.Generator) -> dict:
     """The same measures of segmentations that know nothing of rooms, and of one that reads at each door."""
     moves = [each[1:, 0] != each[:-1, 0] for each in states]
@@ -1029,17 +1046,9 @@ def floors(rooms: list[np.ndarray], states: list[np.ndarray], read_rate: float, 
     made |= {f"every {k} steps": [np.arange(1, len(part) + 1) % k == 0 for part in moves] for k in range(2, 8)}
     made |= {f"every {k} moves" if k > 1 else "every move": every(k) for k in (1, 2, 3)}
     made["at each door"] = [(each[:-1] < 4) & (each[1:] >= 4) for each in rooms]
-    return {name: boundary_scores(found, rooms) for name, found in made.items()}
-
-
-def area_under_curve(scores: np.ndarray, true: np.ndarray) -> float:
-    """Probability that a boundary has a higher score than another step; ties count half."""
-    _, inverse, counts = np.unique(scores, return_inverse=True, return_counts=True)
-    ranks = (np.cumsum(counts) - (counts - 1) / 2)[inverse]
-    positives = int(true.sum())
-    if positives in (0, len(true)):
-        return math.nan
-    return float((ranks[true].sum() - positives * (positives + 1) / 2) / (positives * (len(true) - positives)))
+    return {
+        name: boundary_scores(found, rooms) | curve_areas(np.concatenate(found), rooms) for name, found in made.items()
+    }
 
 
 def linear_probe(train: tuple[np.ndarray, np.ndarray], test: tuple[np.ndarray, np.ndarray]) -> float:
@@ -1150,19 +1159,15 @@ def evaluate(model: HWM, episodes: Split, args: Args, device: torch.device) -> d
     heldout = episodes.heldout
     rooms, states = [episode.rooms for episode in heldout], [episode.states for episode in heldout]
     torch.manual_seed(args.seed)
-    rng = np.random.default_rng(args.seed)
-    labels = {"8_labels": rooms, "4_rooms": [merge_doors(each) for each in rooms]}
-    results = {}
+    rng, chance, results = np.random.default_rng(args.seed), np.random.default_rng([args.seed, 1]), {}
     for mode in ("prior", "sampled", "posterior"):
         made = segment(model, heldout, mode, device)
         result = {**boundary_scores(made.found, rooms), "reconstruction_mse": made.error}
-        for name, each in labels.items():
-            true = np.concatenate([part[1:] != part[:-1] for part in each])
-            result[f"area_under_curve_{name}"] = area_under_curve(made.scores, true)
+        result |= curve_areas(made.scores, rooms)
         standard = (made.z - made.z.mean(0)) / (made.z.std(0) + 1e-4)
-        result["mutual_information_z_room"] = normalised_mutual_information(
-            k_means(standard, 8, rng), np.concatenate(rooms)
-        )
+        clusters, labels = k_means(standard, 8, rng), np.concatenate(rooms)
+        result["mutual_information_z_room"] = normalised_mutual_information(clusters, labels)
+        result["mutual_information_by_chance"] = normalised_mutual_information(clusters, chance.permutation(labels))
         result["probes"] = probes(segment(model, episodes.probed, mode, device), made, episodes.probed, heldout)
         results[mode] = result
     constant = np.concatenate([episode.frames for episode in heldout]) / 255 - model.normalizer().mean

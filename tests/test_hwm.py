@@ -613,6 +613,11 @@ def test_floors_are_what_they_say():
     made = method.floors(labels, states, 0.2, rng)
     assert made["always"]["read_rate"] == 1 and made["never"]["f1_8_labels_1"] == 0
     assert made["coin at the model's rate, on moves"]["read_rate"] == pytest.approx(0.2, abs=0.02)
+    assert made["never"]["area_under_curve_4_rooms"] == made["always"]["area_under_curve_4_rooms"] == 0.5
+    door = np.concatenate([(each[:-1] < 4) & (each[1:] >= 4) for each in labels])
+    true = np.concatenate([each[1:] != each[:-1] for each in labels])
+    hit, false = door[true].mean(), door[~true].mean()  # of one threshold: the area of a curve with one corner
+    assert made["at each door"]["area_under_curve_8_labels"] == pytest.approx((1 + hit - false) / 2)
     assert made["every 3 steps"]["read_rate"] < 1 / 3 and made["at each door"]["door_entry_recall"] == 1
     published = {
         "always": 0.37,
@@ -696,6 +701,7 @@ def test_small_run_leaves_its_records(small_run):
     segmentation = json.loads((small_run / "segmentation.json").read_text())
     assert {"prior", "sampled", "posterior", "floors", "episodes"} <= set(segmentation)
     assert set(segmentation["prior"]["probes"]) == {"room", "cell", "direction", "goal"}
+    assert 0 <= segmentation["prior"]["mutual_information_by_chance"] < 0.5
     assert segmentation["floors"]["at each door"]["door_entry_recall"] == 1
     assert json.loads((small_run / "result.json").read_text())["complete"]
     for name in ("figure_3_4.png", "model.safetensors", "updates.csv", "checkpoint.pt"):
@@ -885,7 +891,9 @@ def test_report_of_part_of_the_runs(small_run, tmp_path):
     assert len(rows) == 9 and {row["rung"] for row in rows} == {"narrow", "faithful"}
     segmentation = json.loads((small_run / "segmentation.json").read_text())
     ignorant = [floor for name, floor in segmentation["floors"].items() if name != "at each door"]
-    assert rows[0]["best_floor_f1_4_rooms_1"] == max(floor["f1_4_rooms_1"] for floor in ignorant)
+    for key in ("f1_4_rooms_1", "area_under_curve_8_labels"):
+        assert rows[0][f"best_floor_{key}"] == max(floor[key] for floor in ignorant)
+    assert rows[0]["best_floor_reconstruction_mse"] == segmentation["mse_of_the_mean_frame"]
     hwm_report.write_report(rows, tmp_path / "runs", tmp_path / "out")
     known = hwm_report.read_known(tmp_path / "out", rows[:3])
     assert known == [row for row in rows if row["run"] != rows[0]["run"]]
@@ -894,6 +902,10 @@ def test_report_of_part_of_the_runs(small_run, tmp_path):
     table = (tmp_path / "out" / "table.md").read_text()
     read_rate = segmentation["prior"]["read_rate"]
     assert f"{read_rate:.2f} ± 0.00" in table and "(c)" not in table
+    frequent = [
+        segmentation["prior"]["probes"][kind]["most frequent"] for kind in ("room", "cell", "direction", "goal")
+    ]
+    assert f"| the most frequent one | {' | '.join(f'{value:.2f}' for value in frequent)} |" in table
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         *("figure_3_4_faithful.png", "figure_3_4_narrow.png", "runs.csv", "table.md")
     ]

@@ -418,7 +418,7 @@ def study(script: str, folder: Path, stand_in: str = STAND_IN, **settings: str) 
         ("gopher_ram.sh", {}, 3, "gopher_ram.py"),
         ("fourrooms.sh", {"SEEDS": "1"}, 5, "dreamer_report.py"),
         ("fourrooms.sh", {"SEEDS": "1", "AGENTS": "hwm dreamer_early", "STEPS": "1060000"}, 2, "dreamer_report.py"),
-        ("hwm_segment.sh", {"SEEDS": "1 2"}, 2 + 2 * 8, "hwm_report.py"),
+        ("hwm_segment.sh", {"SEEDS": "1 2"}, 2 + 2 * 9, "hwm_report.py"),
         ("ppo_k10.sh", {"SEEDS": "1"}, 6, "ppo_k10_report.py"),
     ],
 )
