@@ -193,6 +193,11 @@ def test_interval_of_the_seeds_is_that_of_the_t_distribution():
 
 
 # Driving
+def test_the_rule_picks_the_smallest_alpha_above_the_human():
+    curve = {0.0: [9.0], 0.3: [4.0, 5.0], 0.5: [6.0, 5.0], 0.7: [8.0]}
+    assert torcs.representative_alpha(curve, 5.0) == 0.5 and torcs.representative_alpha(curve, 9.0) is None
+
+
 def test_marks_of_the_road_are_passed_once_a_lap():
     place = np.arange(205.0, 4_600.0, 10.0)  # two laps and some of a road of 2,000 m
     found = torcs.crossings(place, np.array([100.0, 300.0, 900.0]), 2_000.0)
