@@ -1,18 +1,19 @@
 #!/usr/bin/env bash
 # Gopher: a teacher from 10,010,000 frames of pixels, and students of it and of the synthetic human over α, and over T at
-# two α; the runs behind benchmark/results/gopher/. Can be sent again after every stop. By benchmark/results/speed/gopher.md
-# the teacher takes about 3 hours of a core with bfloat16, several times as long without; its replay takes 8 GB.
+# two α, with controls; the runs behind benchmark/results/gopher/. Can be sent again after every stop. The teacher takes about 3
+# hours of a core with bfloat16, 4 without (benchmark/results/speed/gopher.md), 7 of two cores without AVX-512; its replay 8 GB.
 #   benchmark/gopher_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
 #   THREADS=2 benchmark/gopher_alpha.sh     the teacher with both cores, where nothing else runs
 #   WORKERS=50 SLURM=benchmark/slurm_template.sh benchmark/gopher_alpha.sh     students on a cluster; again for the report
-#   ALPHAS=0.0 TEMPERATURES= TEACHER= benchmark/gopher_alpha.sh     the human's clones alone, which need no teacher
+#   ALPHAS=0.0 TEMPERATURES= CONTROL_SEEDS= TEACHER= benchmark/gopher_alpha.sh     the human's clones alone, which need no teacher
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/gopher}
 OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1} TEACHER=${TEACHER-$RUNS/teacher_seed1}
 ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
 TEMPERATURES=${TEMPERATURES-0.1 0} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0}
+CONTROL_SEEDS=${CONTROL_SEEDS-${SEEDS%% *}}
 . benchmark/sweep_lines.sh  # sweep
 mkdir -p "$RUNS"
 if [ -n "$TEACHER" ]; then
@@ -21,6 +22,10 @@ if [ -n "$TEACHER" ]; then
   "$PYTHON" cleanrl_thesis/dqn_gopher.py --life-loss-ends --n-step 3 --anneal-lr --bf16 \
     --num-threads "$THREADS" --save-model --eval-episodes 400 --run-dir "$TEACHER" --resume
 fi
+for seed in $CONTROL_SEEDS; do  # a human who reacts to what the student sees too
+  demos="$RUNS/quick_demos_seed$seed"
+  [ -e "$demos/manifest.json" ] || "$PYTHON" benchmark/gopher_players.py --seed "$seed" --demos "$demos"
+done
 student() {  # seed, α, name, more flags
   local teacher="--teacher $TEACHER"
   if [ "$2" = 0.0 ]; then teacher=; fi  # a clone of the human
@@ -35,7 +40,13 @@ student() {  # seed, α, name, more flags
       for seed in $SEEDS; do student "$seed" "$alpha" "T${temperature}_alpha$alpha" --temperature "$temperature"; done
     done
   done
+  for seed in $CONTROL_SEEDS; do
+    for alpha in 0.0 0.8; do
+      student "$seed" "$alpha" "quick_alpha$alpha" --demos "$RUNS/quick_demos_seed$seed"
+      student "$seed" "$alpha" "episode_alpha$alpha" --split episode
+    done
+  done
 } | sweep students cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --compile --save-model || code=$?
 [ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
-"$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT"
+"$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT" ${NOTE:+--note "$NOTE"}
 exit "$code"

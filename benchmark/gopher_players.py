@@ -2,6 +2,7 @@
 
     python benchmark/gopher_players.py                 # random play and the synthetic human, beside Table 2.2's human
     python benchmark/gopher_players.py --calibrate     # neighbouring constants too
+    python benchmark/gopher_players.py --demos DIR     # demonstrations of a human who acts on what the student sees too
 
 A hole that is filled up by one row gives 20 points, a gopher that is hit 100. OpenAI Baselines, with which the thesis'
 DQN was trained, sees an episode for each life, and the rewards' signs instead of the rewards. Writes
@@ -21,9 +22,13 @@ UNITS = {  # a score of each episode, or of each of its lives
     "points of a game": lambda method, episode: [episode["rewards"].sum()],
     "points of a game / 20": lambda method, episode: [episode["rewards"].sum() / 20],
     "points of a game / 100": lambda method, episode: [episode["rewards"].sum() / 100],
+    "points of a life / 20": lambda method, episode: [sum(part) / 20 for part in lives_of(method, episode)],
     "rewards of a game": lambda method, episode: [(episode["rewards"] > 0).sum()],
     "rewards of a life": lambda method, episode: method.rewards_per_life(episode),
 }
+QUICK = {
+    "reaction": 2
+}  # of the last four frames it needs the second and the third, where the calibrated one needs what was before
 CALIBRATION = {
     "reaction": (3, 4, 5),
     "aim_error": (2.0, 3.0, 4.0),
@@ -40,8 +45,16 @@ class Args:
     """seed of the games and of the players"""
     calibrate: bool = False
     """also play with neighbouring constants of the synthetic human, one changed at a time"""
+    demos: Path | None = None
+    """only write demonstrations of a quick human into this folder, as many as a student takes by default"""
     out: Path = ROOT / "benchmark" / "results" / "gopher"
     """folder for the results"""
+
+
+def lives_of(method, episode: dict[str, np.ndarray]) -> list[np.ndarray]:
+    """The rewards of each life, as `rewards_per_life` parts them."""
+    lost = np.flatnonzero(np.diff(episode["lives"]) < 0) + 2
+    return [part for part in np.split(episode["rewards"], lost) if len(part)]
 
 
 def random_player(method, seed: int, episode: int):
@@ -78,8 +91,24 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def quick_human(method) -> type:
+    """The synthetic human with a reaction time of two actions, 133 ms."""
+    return type("QuickHuman", (method.SyntheticGopherHuman,), QUICK)
+
+
+def write_quick_demonstrations(method, args: Args) -> None:
+    """Demonstrations of the quick human, in the games of the calibrated one."""
+    method.SyntheticGopherHuman = quick_human(method)
+    demo_args = method.complete_args(method.Args(env_id=ENV_ID, seed=args.seed, alpha=0.0))
+    args.demos.mkdir(parents=True, exist_ok=True)
+    about = {"env_id": ENV_ID, "player": "synthetic human, quick", "mode": "scripted"}
+    method.save_episodes(args.demos, method.make_gopher_demonstrations(demo_args), about)
+
+
 def main(args: Args) -> None:
     method = load_method("distill_hybrid")
+    if args.demos is not None:
+        return write_quick_demonstrations(method, args)
     human = method.SyntheticGopherHuman
     rows = measure(method, "random", functools.partial(random_player, method), args)
     rows += measure(method, "synthetic human", human, args)

@@ -27,11 +27,13 @@ from apple_report import (
 )
 from common import ROOT, UsageError, commit, commit_of, finished_runs, published_table, run_main, write_csv
 from gopher_players import Args as PlayersArgs
-from gopher_players import load_method, measure
+from gopher_players import load_method, measure, quick_human
 from matplotlib.figure import Figure
 
 LIVES, GAMES = "rewards of a life", "points of a game"
 STUDENTS = {"hybrid, α = 0.8": "alpha0.8", "BC, α = 0": "alpha0.0", "distilled DQN, α = 1": "alpha1.0"}
+CONTROLS = ("quick_", "episode_")  # how their folders' names begin
+PLATEAU = "mean of α = 0.1 to 0.6"
 WINDOW = 50  # episodes of the teacher's moving mean
 
 
@@ -39,8 +41,10 @@ WINDOW = 50  # episodes of the teacher's moving mean
 class Args:
     runs: Path = Path("runs/gopher")
     """folder of the runs' folders"""
-    human_episodes: int = 100
+    human_episodes: int = 300
     """games of the synthetic human for each seed"""
+    note: str = ""
+    """a sentence put above the tables, on what the runs do not record themselves"""
     out: Path = ROOT / "benchmark" / "results" / "gopher"
     """folder for tables and figures"""
 
@@ -71,12 +75,12 @@ def read_runs(folder: Path) -> list[dict]:
     return rows
 
 
-def human_rows(seeds: list[int], episodes: int) -> list[dict]:
-    """The synthetic human's games for each seed, in the same units."""
+def human_rows(seeds: list[int], episodes: int, quick: bool = False) -> list[dict]:
+    """The synthetic human's games for each seed, or those of the quick one, in the same units."""
     method = load_method("distill_hybrid")
-    rows = []
+    human, rows = quick_human(method) if quick else method.SyntheticGopherHuman, []
     for seed in seeds:
-        measured = measure(method, "human", method.SyntheticGopherHuman, PlayersArgs(episodes=episodes, seed=seed))
+        measured = measure(method, "human", human, PlayersArgs(episodes=episodes, seed=seed))
         rows += [{**row, "seed": seed} for row in measured if row["unit"] in (LIVES, GAMES)]
     return rows
 
@@ -90,20 +94,23 @@ def score_cells(group: list[dict]) -> str:
 
 
 def table_2_2(rows: list[dict], human: list[dict]) -> str:
-    """Table 2.2, published beside measured, and the points of a game."""
+    """Table 2.2, published beside measured, and the points of a game; nobody has been asked who is a human."""
     published = published_table("table_2_2.csv")
-    lines = ["| agent | | seeds | max | min | avg | std | points of a game |", "|" + "---|" * 8]
+    header = "| agent | | seeds | max, mean over seeds | min, mean over seeds | avg | std | taken for a human, of 52 | points of a game |"
+    lines = [header, "|" + "---|" * 9]
     measured = {"human": [("synthetic", human)], "DQN": [("greedy", select(rows, "teacher", "greedy"))]}
     measured |= {name: [(mode, select(rows, kind, mode)) for mode in ACTS] for name, kind in STUDENTS.items()}
     for agent, groups in measured.items():
         if agent in published:
-            numbers = " | ".join(published[agent][name] for name in ("max", "min", "avg", "std"))
-            lines.append(f"| {agent} | **published** | 1 | {numbers} | |")
+            columns = ("max", "min", "avg", "std", "identified_as_human_of_52")
+            lines.append(
+                f"| {agent} | **published** | 1 | {' | '.join(published[agent][name] for name in columns)} | |"
+            )
         for acts, group in groups:
             in_units = {unit: [row for row in group if row["unit"] == unit] for unit in (LIVES, GAMES)}
             if group:
                 points = with_interval([row["mean"] for row in in_units[GAMES]], 0)
-                lines.append(f"| {agent} | {ACTS.get(acts, acts)} | {score_cells(in_units[LIVES])} | {points} |")
+                lines.append(f"| {agent} | {ACTS.get(acts, acts)} | {score_cells(in_units[LIVES])} | | {points} |")
     return "\n".join(lines) + "\n"
 
 
@@ -114,10 +121,16 @@ def by_seed(rows: list[dict]) -> dict[int, float]:
 def trend(curve: dict[float, dict[int, float]], low: float, high: float) -> str:
     """How much a straight line through the scores of α = `low` to `high` rises, with the interval over seeds that have all."""
     alphas = [alpha for alpha in curve if low <= alpha <= high]
-    seeds = set.intersection(*(set(curve[alpha]) for alpha in alphas)) if len(alphas) > 2 else set()
-    slopes = [np.polyfit(alphas, [curve[alpha][seed] for alpha in alphas], 1)[0] for seed in sorted(seeds)]
+    slopes = [np.polyfit(alphas, [curve[a][seed] for a in alphas], 1)[0] for seed in plateau(curve, low, high)]
     rise, half = interval([(alphas[-1] - alphas[0]) * slope for slope in slopes])
-    return "" if np.isnan(rise) else f"{rise:+.1f}" + ("" if np.isnan(half) else f" ± {half:.1f}")
+    return "" if np.isnan(rise) else f"{rise:+.1f}" + ("" if np.isnan(half) else f" ± {half:.1f}") + f" ({len(slopes)})"
+
+
+def plateau(curve: dict[float, dict[int, float]], low: float, high: float) -> dict[int, float]:
+    """The mean over α = `low` to `high` of each seed that has all of them."""
+    alphas = [alpha for alpha in curve if low <= alpha <= high]
+    seeds = set.intersection(*(set(curve[alpha]) for alpha in alphas)) if len(alphas) > 2 else set()
+    return {seed: float(np.mean([curve[alpha][seed] for alpha in alphas])) for seed in sorted(seeds)}
 
 
 def own_error(rows: list[dict]) -> float:
@@ -128,15 +141,18 @@ def own_error(rows: list[dict]) -> float:
 
 def less(first: dict[int, float], second: dict[int, float], error: float = 0.0) -> str:
     """Mean difference of the seeds that both have, with its interval; `error` is the standard error that all share."""
-    difference, half = interval([first[seed] - second[seed] for seed in first.keys() & second.keys()])
+    differences = [first[seed] - second[seed] for seed in first.keys() & second.keys()]
+    difference, half = interval(differences)
     half = float(np.hypot(half, 1.96 * error))
-    return "" if np.isnan(difference) else f"{difference:+.1f}" + ("" if np.isnan(half) else f" ± {half:.1f}")
+    spread = "" if np.isnan(half) else f" ± {half:.1f}"
+    return "" if np.isnan(difference) else f"{difference:+.1f}{spread} ({len(differences)})"
 
 
 def claims_table(rows: list[dict], human: list[dict]) -> str:
-    """The order, the plateau below α = 0.6 and the rise from 0.7 of Fig. 2.6, as differences seed by seed.
+    """The order, the plateau up to α = 0.6, at the human's score, and the rise from 0.7 of Fig. 2.6; in brackets the seeds.
 
-    The first column decides, students who sample, of the best test accuracy; the others are for comparison.
+    Differences are taken seed by seed. The first column decides, students who sample, of the best test accuracy; the others are
+    for comparison.
     """
     published = {name: float(row["avg"]) for name, row in published_table("table_2_2.csv").items()}
     lines = [f"| rewards of a life | published | {' | '.join(ACTS.values())} |", "|---|---|" + "---|" * len(ACTS)]
@@ -148,7 +164,8 @@ def claims_table(rows: list[dict], human: list[dict]) -> str:
         ("hybrid, α = 0.8", "human"),
         ("hybrid, α = 0.8", "BC, α = 0"),
         ("distilled DQN, α = 1", "hybrid, α = 0.8"),
-        ("α = 0.6", "α = 0"),
+        (PLATEAU, "human"),
+        ("α = 0.6", "α = 0.1"),
         ("α = 1", "α = 0.7"),
     )
     for first, second in pairs:
@@ -158,13 +175,13 @@ def claims_table(rows: list[dict], human: list[dict]) -> str:
             curve = alpha_curve([row for row in rows if row["unit"] == LIVES], mode)
             scores = {name: curve.get(float(kind[5:]), {}) for name, kind in STUDENTS.items()}
             scores |= {f"α = {alpha:g}": values for alpha, values in curve.items()}
-            scores |= {"DQN": teachers, "human": by_seed(human)}
+            scores |= {"DQN": teachers, "human": by_seed(human), PLATEAU: plateau(curve, 0.1, 0.6)}
             have = scores.get(first) and scores.get(second)
             error = own_error(rows) if first == "DQN" else 0.0
             cells.append(less(scores[first], scores[second], error) if have else "")
         lines.append(f"| {first}, less {second} | {' | '.join(cells)} |")
     curves = [alpha_curve([row for row in rows if row["unit"] == LIVES], mode) for mode in ACTS]
-    for low, high in ((0.0, 0.6), (0.7, 1.0)):
+    for low, high in ((0.1, 0.6), (0.7, 1.0)):
         cells = [trend(curve, low, high) for curve in curves]
         lines.append(f"| a straight line from α = {low:g} to {high:g} rises by | | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
@@ -184,13 +201,16 @@ def alpha_table(rows: list[dict], mode: str, human: float) -> str:
     lines.append("|---|" + "---|" * len(columns))
     for alpha in alphas:
         lines.append(f"| {alpha} | {' | '.join(cell(curve.get(alpha, {}), most) for curve in columns.values())} |")
-    picked = [representative_alpha(curve, human) for curve in columns.values()]
+    picked = [representative_alpha(curve, human) if len(curve) == len(alphas) else "" for curve in columns.values()]
     lines.append(f"| rule picks | {' | '.join('none' if alpha is None else str(alpha) for alpha in picked)} |")
     return "\n".join(lines) + "\n"
 
 
 def agreement_table(rows: list[dict]) -> str:
-    """How often the kept network agrees with its teachers on frames that it did not learn from."""
+    """How often the kept network agrees with its teachers on the test frames, which chose it.
+
+    They are drawn one by one, so that neighbours which share three of four pictures are learned from, but for "episode_".
+    """
     lines = ["| runs | seeds | kept epochs | agrees with DQN | with human |", "|---|---|---|---|---|"]
     kept = [row for row in rows if row["mode"] == "sampled" and row["unit"] == LIVES]
     for kind in sorted({row["kind"] for row in kept}):
@@ -199,6 +219,21 @@ def agreement_table(rows: list[dict]) -> str:
         known = {name: [row[name] for row in group] for name in ("agrees_with_dqn", "agrees_with_human")}
         cells = ["" if np.isnan(values).any() else with_interval(values, 3) for values in known.values()]
         lines.append(f"| {kind} | {len(group)} | {epochs} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def controls_table(rows: list[dict], quick: list[dict]) -> str:
+    """Students of a human who reacts within what they see ("quick"), and those whose test frames are of other episodes."""
+    lines = [
+        "| run | seeds | its human | sampled | greedy | sampled, less the run without the word |",
+        "|" + "---|" * 6,
+    ]
+    lives = [row for row in rows if row["unit"] == LIVES]
+    for kind in sorted({row["kind"] for row in lives if row["kind"].startswith(CONTROLS)}):
+        scores, usual = (by_seed(select(lives, name, "sampled")) for name in (kind, kind.split("_", 1)[1]))
+        human = with_interval([row["mean"] for row in quick if row["unit"] == LIVES], 1) if "quick" in kind else ""
+        means = [with_interval([row["mean"] for row in select(lives, kind, mode)], 1) for mode in ("sampled", "greedy")]
+        lines.append(f"| {kind} | {len(scores)} | {human} | {' | '.join(means)} | {less(scores, usual)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -213,10 +248,8 @@ def figure_2_6(rows: list[dict], human: float) -> Figure:
         for i, temperature in enumerate(swept_temperatures(rows)):
             curve = alpha_curve(rows, mode, temperature)
             means, halves = np.array([interval(list(scores.values())) for scores in curve.values()]).T
-            style = {"color": f"C{i}", "linestyle": "-" if len(curve) > 4 else ":"}
-            axes.plot(list(curve), means, "o", markersize=3, label=f"T = {temperature}", **style)
-            low, high = means - np.nan_to_num(halves), means + np.nan_to_num(halves)
-            axes.fill_between(list(curve), low, high, color=f"C{i}", alpha=0.15, linewidth=0)
+            is_swept, style = len(curve) > 4, {"color": f"C{i}", "markersize": 3, "label": f"T = {temperature}"}
+            axes.errorbar(list(curve), means, np.nan_to_num(halves), fmt="o-" if is_swept else "o", capsize=2, **style)
         if teacher:
             axes.axhline(np.mean(teacher), color="black", linestyle="--", linewidth=1, label="DQN")
         axes.axhline(human, color="black", linestyle=":", linewidth=1, label="synthetic human")
@@ -228,8 +261,10 @@ def figure_2_6(rows: list[dict], human: float) -> Figure:
     for axes in grid[:, 0]:
         axes.set_ylabel("rewards of a life")
     figure.legend(*grid[0, 0].get_legend_handles_labels(), fontsize="small", loc="outside right center")
-    seeds = len({row["seed"] for row in rows if row["kind"] != "teacher"})
-    figure.suptitle(f"Fig. 2.6: mean score over α; bands are 95% intervals of {seeds} seed{'s' * (seeds > 1)}")
+    curves = [alpha_curve(rows, "sampled", temperature) for temperature in swept_temperatures(rows)]
+    seeds = sorted({len(scores) for curve in curves for scores in curve.values()})
+    number = " to ".join(map(str, sorted({seeds[0], seeds[-1]})))
+    figure.suptitle(f"Fig. 2.6: mean score over α; bars are 95% intervals of {number} seed{'s' * (seeds[-1] > 1)}")
     return figure
 
 
@@ -246,7 +281,18 @@ def teacher_curve(run: Path) -> list[dict]:
     return [{"frames": int(x), f"mean_of_{width}_episodes": round(float(y), 1)} for x, y in zip(at, values)]
 
 
-def provenance(rows: list[dict]) -> str:
+def teacher_flags(runs: Path) -> str:
+    """In what the teachers differ from the defaults of dqn_gopher.py, which are the thesis'."""
+    flags = set()
+    for run, _ in finished_runs(runs):
+        args = json.loads((run / "args.json").read_text())
+        if run.name.startswith("teacher"):
+            named = [("--life-loss-ends", args["life_loss_ends"]), (f"--n-step {args['n_step']}", args["n_step"] > 1)]
+            flags.add(" ".join(flag for flag, holds in (*named, ("--anneal-lr", args["anneal_lr"])) if holds))
+    return f"The DQN was trained with `{'`, `'.join(sorted(flags))}`, which is ours. " if flags - {""} else ""
+
+
+def provenance(rows: list[dict], runs_folder: Path, note: str) -> str:
     """What the results rest on."""
     runs = {(row["kind"], row["seed"]): row for row in rows}
     hours = sum(row["training_seconds"] * row["threads"] for row in runs.values()) / 3600
@@ -257,8 +303,9 @@ def provenance(rows: list[dict]) -> str:
     return (
         f"`benchmark/gopher_alpha.sh`, commits: {'; '.join(made_at)}; this report at {commit()}. {len(runs)} runs, "
         f"{hours:.1f} core-hours of training, in {arithmetic}; each ± is a 95% t-interval over seeds. All students learn from "
-        "the same DQN, another of which would be other; differences from it hold the error of its own score. A student is of the "
-        "epoch with the best test accuracy where no other is named; greedy players have 1% of random actions.\n\n"
+        "the same DQN, another of which would be other; differences from it hold the error of its own score. "
+        f"{teacher_flags(runs_folder)}A student learns at T = 0.01 where no other is named, and is of the epoch with the best test "
+        f"accuracy; greedy players have 1% of random actions.{f' {note}' if note else ''}\n\n"
     )
 
 
@@ -268,6 +315,7 @@ def main(args: Args) -> None:
         raise UsageError(f"--runs {args.runs}: holds no finished run")
     lives = [row for row in rows if row["unit"] == LIVES]
     human = human_rows(sorted({row["seed"] for row in rows}), args.human_episodes)
+    quick_seeds = sorted({row["seed"] for row in rows if row["kind"].startswith("quick")})
     human_score = mean_score(by_seed(human))
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "runs.csv", rows)
@@ -276,6 +324,8 @@ def main(args: Args) -> None:
         sections["The thesis' claims"] = claims_table(rows, human)
         sections["Fig. 2.6"] = "\n".join(alpha_table(lives, mode, human_score) for mode in ACTS)
         sections["Which network is kept"] = agreement_table(rows)
+        if any(row["kind"].startswith(CONTROLS) for row in rows):
+            sections["Controls"] = controls_table(rows, human_rows(quick_seeds, args.human_episodes, quick=True))
         figure_2_6(lives, human_score).savefig(args.out / "fig_2_6.png", dpi=130)
     for run, _ in finished_runs(args.runs):
         if run.name.startswith("teacher"):
@@ -283,7 +333,9 @@ def main(args: Args) -> None:
             curve = teacher_curve(run)
             if curve:
                 write_csv(args.out / "teacher.csv", curve)
-    text = provenance(rows) + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
+    text = provenance(rows, args.runs, args.note) + "\n".join(
+        f"## {name}\n\n{table}" for name, table in sections.items()
+    )
     (args.out / "table.md").write_text(text)
     print(text)
 

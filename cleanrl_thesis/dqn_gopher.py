@@ -1,6 +1,7 @@
 """DQN on Atari's Gopher: the reinforcement learning teacher of the hybrid agent (thesis section 2.4.2).
 
-    python cleanrl_thesis/dqn_gopher.py --bf16 --save-model --run-dir runs/gopher_teacher     # the teacher, for distill_hybrid.py
+    python cleanrl_thesis/dqn_gopher.py --bf16 --save-model --run-dir runs/gopher_dqn     # as in the thesis, for distill_hybrid.py
+    python cleanrl_thesis/dqn_gopher.py --life-loss-ends --n-step 3 --anneal-lr --bf16 --save-model   # the teacher of the results
     python cleanrl_thesis/dqn_gopher.py --obs-type ram --n-step 3 --life-loss-ends --anneal-lr --total-timesteps 2500000   # minutes
     python cleanrl_thesis/dqn_gopher.py --env-id ALE/Breakout-v5
 
@@ -19,7 +20,8 @@ machine the run ends with the same bytes.
 | repeated actions | with probability 0.25 | `ALE/*-v5`; thesis: not given |
 | games side by side | 8 | ours |
 
-Frames are game frames here, an action lasting four. The replay buffer holds every frame that the agent saw once: 7,063 bytes
+Frames are game frames here, an action lasting four: the "frames of gameplay" of section 2.4.2, to the letter (OpenAI Baselines
+counts actions, of which as many would be 40 million frames). The replay buffer holds every frame that the agent saw once: 7,063 bytes
 for each, 7.8 GB with the room between two checkpoints, in a file that the operating system keeps in memory as far as it can.
 """
 

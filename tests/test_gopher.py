@@ -490,7 +490,7 @@ def test_runs_killed_at_random_end_with_the_same_bytes(small, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_it_learns_from_the_memory(tmp_path):
-    """Random play gets 335 points; 2,000,000 frames bring five times as many (benchmark/gopher_ram.sh)."""
+    """Random play gets 335 points; 2,500,000 frames bring five times as many (benchmark/gopher_ram.sh)."""
     flags = ["--obs-type", "ram", "--n-step", 3, "--life-loss-ends", "--anneal-lr", "--total-timesteps", 1_000_000]
     run(*flags, "--eval-episodes", 30, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
     assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["mean"] > 750
@@ -536,11 +536,11 @@ def test_the_report_takes_whatever_is_done(pixel_teacher, student, tmp_path):
         json.loads((tmp_path / "runs" / f"alpha{alpha}_seed1" / "result.json").read_text())["evaluation"]["sampled"]
         for alpha in ("0.8", "0.0")
     )
-    assert "| hybrid, α = 0.8 | **published** | 1 | 132 | 0 | 26.05 | 24.31 | |" in text
+    assert "| hybrid, α = 0.8 | **published** | 1 | 132 | 0 | 26.05 | 24.31 | 31 | |" in text
     mean = hybrid["rewards_per_life"]["mean"]
     assert f"| hybrid, α = 0.8 | sampled | 1 | {hybrid['rewards_per_life']['max']:.0f} |" in text
     assert f"| {mean:.2f} |" in text and f"| {hybrid['mean']:.0f} |" in text
-    assert f"| hybrid, α = 0.8, less BC, α = 0 | +2.1 | {mean - clone['rewards_per_life']['mean']:+.1f} |" in text
+    assert f"| hybrid, α = 0.8, less BC, α = 0 | +2.1 | {mean - clone['rewards_per_life']['mean']:+.1f} (1) |" in text
     assert "| α = 1, less α = 0.7 |  |  |  |  |  |" in text and "nan" not in text
     shutil.copytree(tmp_path / "runs" / "alpha0.0_seed1", tmp_path / "more" / "alpha0_seed1")
     for name in ("teacher_seed1", "teacher_ram_seed1"):  # no student yet, and a run that is none of the sweep
@@ -575,11 +575,14 @@ def test_trends_and_differences_of_scores():
     alphas = [0.0, 0.2, 0.4, 0.6]
     rises = [0.6 * stats.linregress(alphas, [curve[a][seed] for a in alphas]).slope for seed in (1, 2)]
     half = stats.t.ppf(0.975, 1) * stats.sem(rises)
-    assert report.trend(curve, 0, 0.6) == f"{np.mean(rises):+.1f} ± {half:.1f}"
+    assert report.trend(curve, 0, 0.6) == f"{np.mean(rises):+.1f} ± {half:.1f} (2)"
+    level = report.plateau(curve, 0, 0.6)
+    assert level == {seed: pytest.approx(np.mean([curve[a][seed] for a in alphas])) for seed in (1, 2)}
+    assert report.plateau(curve, 0.6, 0.7) == {}
     assert report.trend(curve, 0.6, 0.7) == ""  # two points are no line
     first, second = {1: 40.0, 2: 40.0, 3: 40.0}, {2: 25.0, 3: 26.0, 4: 0.0}
     spread = stats.t.ppf(0.975, 1) * stats.sem([15.0, 14.0])
-    assert report.less(first, second, 2.0) == f"+14.5 ± {np.hypot(spread, 1.96 * 2):.1f}"
+    assert report.less(first, second, 2.0) == f"+14.5 ± {np.hypot(spread, 1.96 * 2):.1f} (2)"
     teacher = [{"kind": "teacher", "mode": "greedy", "unit": report.LIVES, "std": 30.0, "scores": 900}]
     assert report.own_error(teacher) == pytest.approx(1)
 
