@@ -10,6 +10,7 @@ import itertools
 import json
 import re
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -281,10 +282,10 @@ def figure_2_4(rows: list[dict], humans: dict[str, float]) -> Figure:
 # ---------------------------------------------------------------------------------------------------------------------
 # Human-likeness without people
 # ---------------------------------------------------------------------------------------------------------------------
-def load_student(method, folder: Path):
+def load_student(method, folder: Path, obs_shape: tuple[int, ...] = (6,), num_actions: int = 9):
     with safetensors.safe_open(folder / "model.safetensors", "pt") as file:
         args = json.loads(file.metadata()["args"])
-    student = method.Student((6,), 9, args["hidden_size"])
+    student = method.Student(obs_shape, num_actions, args["hidden_size"])
     student.load_state_dict(safetensors.torch.load_file(folder / "model.safetensors"))
     return student
 
@@ -330,15 +331,15 @@ def auc(positive: np.ndarray, negative: np.ndarray) -> float:
     return stats.mannwhitneyu(positive, negative).statistic / (len(positive) * len(negative))
 
 
-def tell_apart(human: list[dict], agent: list[dict], seed: int) -> float:
+def tell_apart(human: list[dict], agent: list[dict], seed: int, clips: Callable = clips) -> float:
     """AUC on clips of held-out episodes of a classifier that learned to tell the agent from the human on the others."""
-    (human_clips, numbers), (agent_clips, _) = clips(human), clips(agent)
-    training = torch.from_numpy(numbers < len(human) // 2)
-    x = torch.cat([human_clips[training], agent_clips[training]])
-    y = torch.cat([torch.zeros(int(training.sum())), torch.ones(int(training.sum()))])
+    (human_clips, human_numbers), (agent_clips, agent_numbers) = clips(human), clips(agent)
+    of_human, of_agent = (torch.from_numpy(each < len(human) // 2) for each in (human_numbers, agent_numbers))
+    x = torch.cat([human_clips[of_human], agent_clips[of_agent]])
+    y = torch.cat([torch.zeros(int(of_human.sum())), torch.ones(int(of_agent.sum()))])
     torch.manual_seed(seed)
     network = nn.Sequential(
-        *(nn.Conv1d(11, 32, 5), nn.ReLU(), nn.Conv1d(32, 32, 5, stride=2), nn.ReLU()),
+        *(nn.Conv1d(x.shape[1], 32, 5), nn.ReLU(), nn.Conv1d(32, 32, 5, stride=2), nn.ReLU()),
         *(nn.AdaptiveAvgPool1d(4), nn.Flatten(), nn.Linear(128, 32), nn.ReLU(), nn.Linear(32, 1)),
     )
     optimizer = torch.optim.Adam(network.parameters(), 1e-3, weight_decay=1e-4)
@@ -349,7 +350,7 @@ def tell_apart(human: list[dict], agent: list[dict], seed: int) -> float:
             loss.backward()
             optimizer.step()
     with torch.no_grad():
-        scores = [network(kind[~training]).squeeze(1).numpy() for kind in (agent_clips, human_clips)]
+        scores = [network(part).squeeze(1).numpy() for part in (agent_clips[~of_agent], human_clips[~of_human])]
     return auc(*scores)
 
 

@@ -49,4 +49,5 @@ student() {  # seed, α, name, more flags
 } | sweep students cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --compile --save-model || code=$?
 [ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
 "$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT" ${NOTE:+--note "$NOTE"}
+"$PYTHON" benchmark/gopher_likeness.py --runs "$RUNS" --out "$OUT"
 exit "$code"

@@ -599,6 +599,44 @@ def test_the_teacher_s_curve_is_the_moving_mean_of_its_episodes(tmp_path):
     assert {row["mean_of_50_episodes"] for row in curve} == {5.0}
 
 
+def test_habits_of_a_player_who_is_known():
+    """A hole is dug at t = 5 and filled by two presses, of which the second moves; a third press is for nothing."""
+    sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
+    likeness = importlib.import_module("gopher_likeness")
+    memory, actions = np.zeros((30, 128), np.int64), np.zeros(30, np.int64)
+    memory[:, distill.SCENE], memory[:, distill.FARMER_X] = distill.IN_PLAY, distill.HOLES[2] + distill.SHOVEL - 5
+    memory[5:12, (distill.ROWS - 1) * distill.ROW_BYTES + distill.HOLE_BYTES[2]] = distill.HOLE_BITS[2]
+    actions[[2, 3, 9, 11, 20]] = [distill.GO_LEFT, distill.GO_RIGHT, distill.FIRE, distill.LEFT_FIRE, distill.FIRE]
+    actions[21] = distill.FIRE  # held
+    rewards = np.zeros(30)
+    rewards[11] = 20.0
+    episode = {"memory": memory, "actions": actions, "rewards": rewards}
+    found = likeness.habits(distill, [episode])
+    expected = {"reaction": 4 / 15 * 1000, "turns": 2 / 2, "needless": 1 / 3, "moving": 1 / 3, "presses": 3}
+    assert found == pytest.approx(expected)
+    cut, numbers = likeness.clips(distill, [episode])
+    assert cut.shape == (1, 12, 30) and numbers.tolist() == [0]
+    assert cut[0, :8, 9].tolist() == [0, 1, 0, 0, 0, 0, 0, 0]
+    assert cut[0, 10, 9].item() == pytest.approx(5 / 80) and cut[0, 11, 9].item() == pytest.approx(1 / 3)
+
+
+def test_likeness_of_whatever_is_done(student, pixel_teacher, tmp_path):
+    """Memory is what the human saw; the table has each agent."""
+    likeness = importlib.import_module("gopher_likeness")
+    make_game = functools.partial(distill.make_atari, "ALE/Gopher-v5", obs_type="ram", frame_stack=1)
+    human, saw = distill.SyntheticGopherHuman(1, 0), []
+    episode = distill.play_atari(lambda obs: (saw.append(obs[0, -1]), human(obs))[1], make_game, [7])[0]
+    assert np.array_equal(likeness.watch_memory(make_game(), episode), np.array(saw))
+    for name, folder in (("teacher_seed1", pixel_teacher), ("alpha0.8_seed1", student)):
+        shutil.copytree(folder, tmp_path / "runs" / name)
+    script = ROOT / "benchmark" / "gopher_likeness.py"
+    run("--runs", "runs", "--games", 2, "--out", "out", cwd=tmp_path, script=script)
+    text = (tmp_path / "out" / "likeness.md").read_text()
+    agents = ["synthetic human", "synthetic human again", "DQN", "α = 0.8, sampled", "α = 0.8, greedy"]
+    assert [line.split(" | ")[0][2:] for line in text.splitlines()[4:]] == agents and "nan" not in text
+    assert "holds no finished student" in run("--runs", "out", cwd=tmp_path, script=script, code=2).stderr
+
+
 def memory_after(actions: list[int]) -> np.ndarray:
     """The console's memory after some actions in an episode without idle frames at first."""
     game = dqn.make_atari("ALE/Gopher-v5", obs_type="ram", frame_stack=1, noop_max=0)
