@@ -648,6 +648,7 @@ def score_over_k(axes, rows: list[dict], column: str) -> None:
         label = METHODS[method] + ("" if method == "PPO" else " 0.03")
         axes.plot(ks, middle, "o-", color=COLOURS[method], markersize=4, label=label)
         axes.fill_between(ks, low, high, color=COLOURS[method], alpha=0.15, linewidth=0)
+        axes.vlines(ks, low, high, color=COLOURS[method], alpha=0.4)  # no band goes to a K that has one d_target
     axes.set(xscale="log", xlabel="K", ylabel="NER", title="(a) all tasks")
     axes.set_xticks(KS, map(str, KS))
     axes.minorticks_off()
