@@ -127,14 +127,14 @@ def reactions(method, episode: dict) -> list[int]:
     """
     depths, actions = depths_of(method, episode["memory"]), episode["actions"]
     count, times = (depths > 0).sum(1), []
-    presses, ways = holds_button(method, actions), lateral(method, actions)
+    held, ways = holds_button(method, actions), lateral(method, actions)
     changes = np.flatnonzero(actions[1:] != actions[:-1]) + 1
     for begin in np.flatnonzero((count[1:] == 1) & (count[:-1] == 0)) + 1:
         place = method.HOLES[depths[begin].argmax()] + method.SHOVEL
         for t in changes[changes >= begin]:
             if count[t] != 1:
                 break
-            if presses[t] or ways[t] * (place - episode["memory"][t, method.FARMER_X]) > 0:
+            if held[t] or ways[t] * (place - episode["memory"][t, method.FARMER_X]) > 0:
                 times.append(int(t - begin))
                 break
     return times
@@ -145,30 +145,35 @@ def holds_button(method, actions: np.ndarray) -> np.ndarray:
     return np.isin(actions, (method.FIRE, UP_FIRE, method.RIGHT_FIRE, method.LEFT_FIRE))
 
 
+def presses(method, episode: dict) -> np.ndarray:
+    """How often the button is pressed in play; with no hole or gopher there; and while the farmer moves."""
+    memory, held = episode["memory"], holds_button(method, episode["actions"])
+    new = held & ~np.concatenate([[False], held[:-1]]) & (memory[:, method.SCENE] == method.IN_PLAY)
+    farmer = memory[:, method.FARMER_X, None]
+    holes = (depths_of(method, memory) > 0) & (np.abs(method.HOLES + method.SHOVEL - farmer) <= REACH)
+    gopher = (memory[:, method.GOPHER_Y] >= method.RISING) & (
+        np.abs(memory[:, method.GOPHER_X] + method.BONK - farmer[:, 0]) <= REACH
+    )
+    needless, moving = new & ~holes.any(1) & ~gopher, new & (lateral(method, episode["actions"]) != 0)
+    return np.array([new.sum(), needless.sum(), moving.sum()])
+
+
+def turns(method, episode: dict) -> int:
+    """How often the farmer is sent the other way; standing still between does not count."""
+    ways = lateral(method, episode["actions"])
+    moves = ways[ways != 0]
+    return np.count_nonzero(moves[1:] != moves[:-1])
+
+
 def habits(method, episodes: list[dict]) -> dict[str, float]:
     """What participants named, as numbers over all episodes."""
-    times, turns, seconds = [], 0, 0.0
-    pressed = needless = moving = rewards = 0
-    for episode in episodes:
-        memory, actions = episode["memory"], episode["actions"]
-        times += reactions(method, episode)
-        ways = lateral(method, actions)
-        moves = ways[ways != 0]
-        turns, seconds = turns + np.count_nonzero(moves[1:] != moves[:-1]), seconds + len(actions) / FPS
-        held = holds_button(method, actions)
-        new = held & ~np.concatenate([[False], held[:-1]]) & (memory[:, method.SCENE] == method.IN_PLAY)
-        farmer = memory[:, method.FARMER_X]
-        hole = (
-            (depths_of(method, memory) > 0) & (np.abs(method.HOLES + method.SHOVEL - farmer[:, None]) <= REACH)
-        ).any(1)
-        gopher = (memory[:, method.GOPHER_Y] >= method.RISING) & (
-            np.abs(memory[:, method.GOPHER_X] + method.BONK - farmer) <= REACH
-        )
-        pressed, needless = pressed + new.sum(), needless + (new & ~hole & ~gopher).sum()
-        moving, rewards = moving + (new & (ways != 0)).sum(), rewards + (episode["rewards"] > 0).sum()
+    times = [time for episode in episodes for time in reactions(method, episode)]
+    pressed, needless, moving = sum(presses(method, episode) for episode in episodes)
+    rewards = sum((episode["rewards"] > 0).sum() for episode in episodes)
+    seconds = sum(len(episode["actions"]) for episode in episodes) / FPS
     return {
         "reaction": median(times) / FPS * 1000,
-        "turns": turns / seconds,
+        "turns": sum(turns(method, episode) for episode in episodes) / seconds,
         "needless": needless / max(1, pressed),
         "moving": moving / max(1, pressed),
         "presses": pressed / max(1, rewards),
