@@ -24,7 +24,7 @@ author.
 | random play at first | 50,000 steps | 1,000,000 steps, with a reward or more at each of 64 goal cells; after 200,000 there are 10 to 17 without one, which are never sought |
 | rates | 2e-4, 4e-5, 1e-4 | 3e-3 for the model (1e-3 did as well *), 1e-3 for actor and critic |
 | rewards | tanh, weight 1 | as they are, weight 10 |
-| layers | SiLU, where DreamerV2 has ELU, which is slower on large batches | the same, normalised in the heads |
+| layers | SiLU, where DreamerV2 has ELU, which is slower on large batches; the last layer of each head starts at 0 | the same, normalised in the heads |
 
 Where there is a *: one run, 60,000 steps with updates (`benchmark/results/dreamer/xs/table.md`).
 """
@@ -283,14 +283,14 @@ def complete_args(args: Args) -> Args:
     counts = "num_envs eval_episodes checkpoint_interval stop_at train_frequency batch_size starts horizon"
     counts += " depth deter stoch hidden_size head_size head_layers slow_interval"
     rates = "model_learning_rate actor_learning_rate critic_learning_rate adam_eps image_scale"
-    scales = "kl_scale entropy_scale reward_scale discount_scale ent_coef weight_decay"
+    scales = "kl_scale entropy_scale reward_scale discount_scale ent_coef"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("chunk_length classes", lambda x: x >= 2, "must be at least 2"),
         (rates, lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("max_grad_norm", lambda x: x > 0, "must be greater than 0"),
         (scales, lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
-        ("gamma gae_lambda kl_balance rewarded_share", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
+        ("gamma gae_lambda kl_balance rewarded_share weight_decay", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("kl_warmup", lambda x: x >= 0, "must be at least 0"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
         ("num_threads", lambda x: 1 <= x <= 1024, "must be between 1 and 1024"),
@@ -1411,13 +1411,18 @@ class CsvLog:
             raise RunError(f"{path}: shorter than at the last checkpoint; the run cannot be resumed")
         self.file.truncate(length)
         self.file.seek(0, os.SEEK_END)
-        self.writer, self.has_header = csv.writer(self.file, lineterminator="\n"), length > 0
+        self.path, self.writer, self.columns = path, csv.writer(self.file, lineterminator="\n"), None
+        if length:
+            with open(path, newline="") as file:
+                self.columns = next(csv.reader(file))
 
     def write(self, row: dict) -> None:
-        """Append a row, after the header where the file is empty."""
-        if not self.has_header:
+        """Append a row, after the header where the file is empty. Raises RunError where the row has other columns."""
+        if self.columns is None:
             self.writer.writerow(row)
-            self.has_header = True
+            self.columns = list(row)
+        if list(row) != self.columns:
+            raise RunError(f"{self.path}: has other columns than this version of the script writes")
         self.writer.writerow(row.values())
 
     def sync(self) -> int:
@@ -1527,7 +1532,7 @@ def fewest_steps(maze: Maze) -> np.ndarray:
 
 
 def evaluate(learner: Learner, args: Args, run_dir: Path) -> dict:
-    """Play `--eval-episodes` episodes that training never saw, greedily; write `evaluation.json`, `dream.png` and videos.
+    """Play `--eval-episodes` episodes with seeds that training does not use, greedily; write `evaluation.json`, `dream.png` and videos.
 
     `optimal` is the mean return of shortest ways from the same starts, `solved` the share of the goals that were reached.
     """
@@ -1768,9 +1773,9 @@ def main(args: Args) -> int:
             updates_csv.write({"global_step": global_step, "charts/episodic_return": mean_return, **metrics})
             if not all(math.isfinite(value) for name, value in metrics.items() if name.startswith("losses/")):
                 raise RunError(f"step {global_step}: a loss is no longer finite ({metrics})")
-        now = time.perf_counter()
-        training_seconds, last_time = training_seconds + now - last_time, now
-        add_scalars(writer, {**metrics, "charts/SPS": global_step / training_seconds}, global_step)
+        seconds, last_time = time.perf_counter() - last_time, time.perf_counter()
+        training_seconds += seconds
+        add_scalars(writer, {**metrics, "charts/SPS": BLOCK / seconds}, global_step)
 
         crossed = global_step // args.checkpoint_interval > (global_step - BLOCK) // args.checkpoint_interval
         if crossed or stop.received or global_step == last_step:

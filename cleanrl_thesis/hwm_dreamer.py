@@ -13,11 +13,11 @@ only where a segment begins, w_t with each step. Actor and critic see both, and 
 | Eq. 3.3.11 | adds J_HWM, a bound to maximise, to losses to minimise | −J_HWM + J_R + J_AC |
 | Eq. 3.3.9 | − log π · V − η H | the λ-return less the slow critic in the place of V |
 | end of an episode | not in the model | a discount head, as in the baseline |
-| v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all (`--classes 1`: normal) |
+| v and y | normal | `xs` and `s`: categorical, as the baseline's state, of as many features in all (`--classes 1`: normal, of fewer but with larger `--stoch-z` and `--stoch-w`) |
 | Z and W | half of S each | `xs`: 4 and 20 of 24 variables, `s`: 8 and 40 of 48, for y has to show each frame between two reads (not compared with halves yet) |
-| boundaries | Eq. 3.3.1 to 3.3.7 | as in `hwm_segment.py` a q(m) that starts with many reads, and a budget of them; where the agents read in the end means little (`benchmark/results/README.md`) |
+| boundaries | Eq. 3.3.1 to 3.3.7 | rung (a) of `hwm_segment.py`, with a q(m) that starts with many reads, and a budget of them (rung (e), with a narrow w, taught no agent: `benchmark/results/dreamer/limits.md`); where the agents read in the end means little (`benchmark/results/README.md`) |
 | the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.1); no read or copy is forced within an episode |
-| faithful model | | `--size thesis --kl-z-scale 1 --kl-w-scale 1 --kl-m-scale 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0` |
+| faithful model | | `--size thesis --kl-z-scale 1 --kl-w-scale 1 --kl-m-scale 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0`, but for the KL terms' balance of 0.8 |
 | Eq. 3.3.8, 3.3.9 | sums over a dream | means, each step weighed by how likely the dream comes to it, and by its discount |
 | acting | not said | m from p(m), z from q where it is read, w from q |
 """
@@ -316,7 +316,7 @@ def complete_args(args: Args) -> Args:
     counts += " depth deter_z stoch_z deter_w stoch_w classes hidden_size head_size head_layers slow_interval"
     counts += " budget_updates"
     rates = "model_learning_rate actor_learning_rate critic_learning_rate adam_eps image_scale"
-    scales = "kl_z_scale kl_w_scale kl_m_scale entropy_scale reward_scale discount_scale ent_coef weight_decay"
+    scales = "kl_z_scale kl_w_scale kl_m_scale entropy_scale reward_scale discount_scale ent_coef"
     scales += " boundary_bound budget_price"
     for names, holds, allowed in (
         (counts, lambda x: x >= 1, "must be at least 1"),
@@ -324,7 +324,11 @@ def complete_args(args: Args) -> Args:
         (rates, lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("max_grad_norm", lambda x: x > 0, "must be greater than 0"),
         (scales, lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
-        ("gamma gae_lambda kl_balance rewarded_share budget", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
+        (
+            "gamma gae_lambda kl_balance rewarded_share budget weight_decay",
+            lambda x: 0 <= x <= 1,
+            "must be between 0 and 1",
+        ),
         ("temperature", lambda x: 0 < x <= 1, "must be greater than 0 and at most 1"),
         ("std_bias read_bias", math.isfinite, "must be finite"),
         ("fixed_interval kl_warmup", lambda x: x >= 0, "must be at least 0"),
@@ -1105,7 +1109,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     decides = 1 - made.forced[1:]  # q(m_t) pairs with p(m_t) where step t + 1 was free to read or to copy
     kl_m = decides * balanced(kl_bernoulli, made.q_m[:-1], made.p_m, args.kl_balance)
     settled = decides * (1 - data.first[:-1])  # a read after the first ends no segment: at the first c knows nothing
-    read_rate = (torch.sigmoid(made.q_m[:-1]) * settled).sum() / settled.sum().clamp(min=1)  # by q(m)
+    expected = (torch.sigmoid(made.q_m[:-1]) * settled).sum() / settled.sum().clamp(min=1)  # the read rate, by q(m)
     features = as_computed(flat.features())
     target = data.rewards.tanh() if args.tanh_reward else data.rewards
     reward = 0.5 * (model.reward(features).squeeze(-1).float() - target.flatten()).square().mean()
@@ -1121,7 +1125,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
         + share * (args.kl_z_scale * kl_z.mean() + args.kl_w_scale * kl_w.mean())
         + args.kl_m_scale * kl_m.mean()
         - (1 - share) * args.entropy_scale * code_entropy
-        + args.budget_price * F.relu(read_rate - budget)
+        + args.budget_price * F.relu(expected - budget)
     )
     inside = 1 - data.first  # a first frame costs tens of nats, which say nothing of the dynamics
     read = made.reads.detach() * inside
@@ -1131,10 +1135,11 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     follows = inside[1:] * (1 - data.first[:-1])
     later = (read[1:] * follows).sum()
     parts |= {"read_rate": later / follows.sum().clamp(min=1), "segment_length": follows.sum() / later.clamp(min=1)}
-    spread = ((torch.sigmoid(made.q_m[:-1]) - read_rate).square() * settled).sum() / settled.sum().clamp(min=1)
-    agreement = ((made.p_m > 0) == (made.q_m[:-1] > 0)).float()
-    parts |= {"read_spread": spread.sqrt()}  # 0: q(m) is the same everywhere
-    parts |= {"agreement": (agreement * decides).sum() / decides.sum().clamp(min=1)}
+    if not args.fixed_interval:
+        spread = ((torch.sigmoid(made.q_m[:-1]) - expected).square() * settled).sum() / settled.sum().clamp(min=1)
+        agreement = ((made.p_m > 0) == (made.q_m[:-1] > 0)).float()
+        parts |= {"read_spread": spread.sqrt()}  # 0: q(m) is the same everywhere
+        parts |= {"agreement": (agreement * decides).sum() / decides.sum().clamp(min=1)}
     return loss, made.belief, {f"losses/{name}": value.detach() for name, value in parts.items()}
 
 
@@ -1624,13 +1629,18 @@ class CsvLog:
             raise RunError(f"{path}: shorter than at the last checkpoint; the run cannot be resumed")
         self.file.truncate(length)
         self.file.seek(0, os.SEEK_END)
-        self.writer, self.has_header = csv.writer(self.file, lineterminator="\n"), length > 0
+        self.path, self.writer, self.columns = path, csv.writer(self.file, lineterminator="\n"), None
+        if length:
+            with open(path, newline="") as file:
+                self.columns = next(csv.reader(file))
 
     def write(self, row: dict) -> None:
-        """Append a row, after the header where the file is empty."""
-        if not self.has_header:
+        """Append a row, after the header where the file is empty. Raises RunError where the row has other columns."""
+        if self.columns is None:
             self.writer.writerow(row)
-            self.has_header = True
+            self.columns = list(row)
+        if list(row) != self.columns:
+            raise RunError(f"{self.path}: has other columns than this version of the script writes")
         self.writer.writerow(row.values())
 
     def sync(self) -> int:
@@ -1740,7 +1750,7 @@ def fewest_steps(maze: Maze) -> np.ndarray:
 
 
 def evaluate(learner: Learner, args: Args, run_dir: Path) -> dict:
-    """Play `--eval-episodes` episodes that training never saw, greedily; write `evaluation.json`, `dream.png` and videos.
+    """Play `--eval-episodes` episodes with seeds that training does not use, greedily; write `evaluation.json`, `dream.png` and videos.
 
     `optimal` is the mean return of shortest ways from the same starts, `solved` the share of the goals that were reached.
     """
@@ -1981,9 +1991,9 @@ def main(args: Args) -> int:
             updates_csv.write({"global_step": global_step, "charts/episodic_return": mean_return, **metrics})
             if not all(math.isfinite(value) for name, value in metrics.items() if name.startswith("losses/")):
                 raise RunError(f"step {global_step}: a loss is no longer finite ({metrics})")
-        now = time.perf_counter()
-        training_seconds, last_time = training_seconds + now - last_time, now
-        add_scalars(writer, {**metrics, "charts/SPS": global_step / training_seconds}, global_step)
+        seconds, last_time = time.perf_counter() - last_time, time.perf_counter()
+        training_seconds += seconds
+        add_scalars(writer, {**metrics, "charts/SPS": BLOCK / seconds}, global_step)
 
         crossed = global_step // args.checkpoint_interval > (global_step - BLOCK) // args.checkpoint_interval
         if crossed or stop.received or global_step == last_step:

@@ -1318,13 +1318,18 @@ class CsvLog:
             raise RunError(f"{path}: shorter than at the last checkpoint; the run cannot be resumed")
         self.file.truncate(length)
         self.file.seek(0, os.SEEK_END)
-        self.writer, self.has_header = csv.writer(self.file, lineterminator="\n"), length > 0
+        self.path, self.writer, self.columns = path, csv.writer(self.file, lineterminator="\n"), None
+        if length:
+            with open(path, newline="") as file:
+                self.columns = next(csv.reader(file))
 
     def write(self, row: dict) -> None:
-        """Append a row, after the header where the file is empty."""
-        if not self.has_header:
+        """Append a row, after the header where the file is empty. Raises RunError where the row has other columns."""
+        if self.columns is None:
             self.writer.writerow(row)
-            self.has_header = True
+            self.columns = list(row)
+        if list(row) != self.columns:
+            raise RunError(f"{self.path}: has other columns than this version of the script writes")
         self.writer.writerow(row.values())
 
     def sync(self) -> int:

@@ -1,10 +1,12 @@
 """DreamerV2: its functions against independent sources, small worlds whose values are known, and small runs."""
 
+import contextlib
 import csv
 import ctypes
 import errno
 import importlib
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -396,6 +398,18 @@ def test_the_action_that_reaches_the_goal_has_its_weight():
     assert method.dream_weights(discounts).squeeze(1).tolist() == pytest.approx([1, 0.9, 0, 0])
 
 
+def test_the_dream_draws_the_state_from_its_prior():
+    model = make_learner().model
+    wake(model)
+    state = method.State(*(part.expand(20_000, -1) for part in model.start(1)))
+    actions = F.one_hot(torch.ones(20_000, dtype=torch.int64), 3).float()
+    after = model.imagine_step(state, actions, model.noise(20_000))
+    deter = model.recur(state, actions)
+    assert torch.equal(after.deter, deter) and after.deter.abs().max() > 0
+    shares = model.prior(deter[:1]).softmax(-1).flatten()
+    assert torch.allclose(after.stoch.mean(0), shares, atol=0.015) and 0.02 < shares.min() < shares.max() < 0.98
+
+
 class ChainState(NamedTuple):
     place: torch.Tensor  # (N, 5) one-hot
 
@@ -576,12 +590,37 @@ def test_policy_learning_in_the_true_dynamics_solves_the_maze():
     assert returns[-1] >= 0.85, returns
 
 
+def test_a_record_with_other_columns_is_not_gone_on_with(tmp_path):
+    """As where a later version of a script logs more: values would stand under the wrong names."""
+    log = method.CsvLog(tmp_path / "log.csv", 0)
+    log.write({"step": 1, "loss": 0.5})
+    for row, error in (({"step": 2, "new": 1, "loss": 0.4}, True), ({"step": 2, "loss": 0.4}, False)):
+        log = method.CsvLog(tmp_path / "log.csv", 16)
+        with pytest.raises(method.RunError, match="log.csv: has other columns") if error else contextlib.nullcontext():
+            log.write(row)
+    log.sync()
+    assert (tmp_path / "log.csv").read_text() == "step,loss\n1,0.5\n2,0.4\n"
+
+
 # Runs
 @pytest.fixture(scope="module")
 def small_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dreamer")
     run(*SMALL, "--run-dir", "run", "--save-model", cwd=folder, script=SCRIPT)
     return folder / "run"
+
+
+def test_comparisons_with_reality_leave_no_trace_in_the_training(small_run, tmp_path, monkeypatch):
+    """As many draws, of other games, between two updates: the parameters in the end are the same."""
+    monkeypatch.setattr(method, "COMPARISON", 500)
+    assert method.cli([*map(str, SMALL), "--run-dir", str(tmp_path / "run")]) == 0
+    rows = list(csv.DictReader((tmp_path / "run" / "updates.csv").read_text().splitlines()))
+    assert all(math.isfinite(float(row["eval/real_return"])) for row in rows)
+    learners = [
+        torch.load(folder / "checkpoint.pt", weights_only=True)["learner"] for folder in (small_run, tmp_path / "run")
+    ]
+    for left, right in zip(*(learner["model"].values() for learner in learners)):
+        assert torch.equal(left, right)
 
 
 @pytest.mark.parametrize("name", ["dreamer_v2", "hwm_dreamer", "hwm_hrl_dreamer"])

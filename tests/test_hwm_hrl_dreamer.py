@@ -16,6 +16,7 @@ from test_dreamer import (
     assert_same_states,
     clipped_parts,
     make_data,
+    wake,
 )
 from test_hwm_dreamer import SMALL, TINY
 
@@ -235,6 +236,14 @@ def test_every_flag_changes_an_update(flags):
     data = make_data([[1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [1, 0, 0, 0, 0, 0]])
     default, changed = (after_an_update(make_agent(**changes), data) for changes in ({}, flags))
     assert not torch.equal(default, changed)
+
+
+def test_both_slow_critics_become_the_critics():
+    behaviour = make_learner().behaviour
+    wake(behaviour)
+    behaviour.copy_critics()
+    for slow, live in ((behaviour.slow_critic, behaviour.critic), (behaviour.slow_high_critic, behaviour.high_critic)):
+        assert all(map(torch.equal, slow.state_dict().values(), live.state_dict().values()))
 
 
 def test_a_dream_without_a_decision_teaches_the_high_level_nothing():
