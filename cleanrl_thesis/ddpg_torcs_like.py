@@ -1,6 +1,6 @@
 """DDPG on a driving task: the reinforcement learning expert of the hybrid by GAIL (thesis section 2.4.3).
 
-    python cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220      # the expert, for gail_hybrid.py
+    python cleanrl_thesis/ddpg_torcs_like.py --compile --save-demos 220 --run-dir runs/expert      # for gail_hybrid.py
     python cleanrl_thesis/ddpg_torcs_like.py --track-name hills --noise ou
     python cleanrl_thesis/ddpg_torcs_like.py --env-id Pendulum-v1 --total-timesteps 50000 --num-envs 1 --frame-skip 1
 
@@ -227,7 +227,8 @@ def complete_args(args: Args) -> Args:
         (counts, lambda x: x >= 1, "must be at least 1"),
         ("learning_rate actor_learning_rate", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
         ("reward_scale", lambda x: 0 < x < math.inf, "must be greater than 0 and finite"),
-        ("critic_l2 noise_std", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
+        ("critic_l2", lambda x: 0 <= x < math.inf, "must be at least 0 and finite"),
+        ("noise_std", lambda x: 0 <= x <= MAX_NOISE, f"must be between 0 and {MAX_NOISE:g}"),
         ("gamma tau", lambda x: 0 <= x <= 1, "must be between 0 and 1"),
         ("seed", lambda x: 0 <= x < 2**32, "must be between 0 and 4294967295"),
         ("num_threads", lambda x: 1 <= x <= 1024, "must be between 1 and 1024"),
@@ -1139,6 +1140,9 @@ def noise_shares(args: Args) -> np.ndarray:
     return np.linspace(1, 0, args.num_envs) if args.noise_ladder else np.ones(args.num_envs)
 
 
+MAX_NOISE = 10.0  # of parameters, which it drowns; no larger one brings actions further away
+
+
 class ParameterNoise:
     """An actor for each environment with noise on its parameters (Plappert et al., 2018), but for those of the norms.
 
@@ -1172,7 +1176,7 @@ class ParameterNoise:
         noisy = numpy_actions(self.optimizer.actor_arrays(self.draw()), obs)
         way = noisy - numpy_actions(self.optimizer.actor_arrays(self.optimizer.actor_vector()), obs)
         distance = float(np.sqrt(np.mean(way * way)))
-        self.size *= 1 / 1.01 if distance > self.target else 1.01
+        self.size = min(self.size * (1 / 1.01 if distance > self.target else 1.01), MAX_NOISE)
         return distance
 
     def state_dict(self) -> dict:
@@ -1496,17 +1500,21 @@ def load_checkpoint(run_dir: Path) -> dict | None:
 def read_arguments(run_dir: Path) -> dict:
     """The arguments of the run in a folder. Raises UsageError where it is no run."""
     try:
-        return json.loads((run_dir / "args.json").read_text())
-    except (OSError, ValueError):
+        return dict(json.loads((run_dir / "args.json").read_text()))
+    except (OSError, ValueError, TypeError):
         raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
 
 
 def check_disk(args: Args, flag: str, value: int, size: int) -> None:
     """Raise UsageError where the replay of a new run, a file of `size` bytes, has no room."""
     folder = (args.run_dir or Path("runs")).absolute()
-    if not (folder / "replay.dat").exists():
-        free = shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
-        require(size <= free, flag, value, f"its replay takes {size / 1e9:,.1f} GB of disk, {free / 1e9:,.1f} are left")
+    try:
+        begun = (folder / "replay.dat").exists()
+        disk = shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists()))
+    except OSError:
+        return  # of a folder that cannot be: `open_run_dir` says so
+    allowed = f"its replay takes {size / 1e9:,.1f} GB of disk, {disk.free / 1e9:,.1f} are left"
+    require(begun or size <= disk.free or disk.total == 0, flag, value, allowed)
 
 
 def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:

@@ -1650,17 +1650,21 @@ def load_checkpoint(run_dir: Path) -> dict | None:
 def read_arguments(run_dir: Path) -> dict:
     """The arguments of the run in a folder. Raises UsageError where it is no run."""
     try:
-        return json.loads((run_dir / "args.json").read_text())
-    except (OSError, ValueError):
+        return dict(json.loads((run_dir / "args.json").read_text()))
+    except (OSError, ValueError, TypeError):
         raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
 
 
 def check_disk(args: Args, flag: str, value: int, size: int) -> None:
     """Raise UsageError where the replay of a new run, a file of `size` bytes, has no room."""
     folder = (args.run_dir or Path("runs")).absolute()
-    if not (folder / "replay.dat").exists():
-        free = shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists())).free
-        require(size <= free, flag, value, f"its replay takes {size / 1e9:,.1f} GB of disk, {free / 1e9:,.1f} are left")
+    try:
+        begun = (folder / "replay.dat").exists()
+        disk = shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.exists()))
+    except OSError:
+        return  # of a folder that cannot be: `open_run_dir` says so
+    allowed = f"its replay takes {size / 1e9:,.1f} GB of disk, {disk.free / 1e9:,.1f} are left"
+    require(begun or size <= disk.free or disk.total == 0, flag, value, allowed)
 
 
 def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:

@@ -25,7 +25,7 @@ Where the default departs from the printed thesis, it follows the logs and the s
 | KLE-Stop looks | after iteration k | before the last step of iteration k | the script reuses that pass |
 | KLE-Rollback undoes | the policy | policy and value function; Adam's moments stay | the script |
 | scaling of observations, rewards | by the variance | by the standard deviation | the script, and openai/baselines |
-| learning rates α_π, α_v | two | one optimiser over both | the script |
+| learning rates α_π, α_v | two, both 3e-4 | one optimiser over both, the same numbers | the script |
 
 Beyond both: every episode is reset with a seed of its own, so its number and its actions determine it; a checkpoint
 keeps those, and a resumed run plays the unfinished episode again instead of copying a simulator's memory.
@@ -1252,8 +1252,8 @@ def load_checkpoint(run_dir: Path) -> dict | None:
 def read_arguments(run_dir: Path) -> dict:
     """The arguments of the run in a folder. Raises UsageError where it is no run."""
     try:
-        return json.loads((run_dir / "args.json").read_text())
-    except (OSError, ValueError):
+        return dict(json.loads((run_dir / "args.json").read_text()))
+    except (OSError, ValueError, TypeError):
         raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
 
 

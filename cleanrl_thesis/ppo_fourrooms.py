@@ -837,8 +837,8 @@ def load_checkpoint(run_dir: Path) -> dict | None:
 def read_arguments(run_dir: Path) -> dict:
     """The arguments of the run in a folder. Raises UsageError where it is no run."""
     try:
-        return json.loads((run_dir / "args.json").read_text())
-    except (OSError, ValueError):
+        return dict(json.loads((run_dir / "args.json").read_text()))
+    except (OSError, ValueError, TypeError):
         raise UsageError(f"--resume {run_dir}: is no run of this script, it has no readable args.json") from None
 
 

@@ -4,6 +4,7 @@ import csv
 import importlib
 import itertools
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -303,10 +304,38 @@ def test_a_resume_with_other_hyperparameters_names_them(student, expert, tmp_pat
 
 
 def test_a_student_goes_on_with_another_interval_between_checkpoints(student, expert, tmp_path):
-    shutil.copytree(student, tmp_path / "run")
     flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--run-dir", "run", "--resume", "--save-model"]
-    done = run(*flags, "--save-demos", 2, "--checkpoint-interval", 1_000, cwd=tmp_path, script=GAIL)
-    assert "is done" in done.stdout
+    flags += ["--save-demos", 2, "--checkpoint-interval"]
+    run(*flags, 1_000, "--stop-at", 512, cwd=tmp_path, script=GAIL)
+    run(*flags, 700, cwd=tmp_path, script=GAIL)
+    assert_same_run(tmp_path / "run", student)
+    assert "is done" in run(*flags, 1_000, cwd=tmp_path, script=GAIL).stdout
+
+
+def test_a_clone_is_evaluated_anew(expert, tmp_path):
+    """As a student is that was trained: from its checkpoint, by other flags of the end."""
+    flags = [*SMALL_GAIL, "--demos-rl", expert / "demos", "--total-timesteps", 0, "--run-dir", "run", "--resume"]
+    run(*flags, cwd=tmp_path, script=GAIL)
+    before = (tmp_path / "run" / "evaluation.json").read_bytes()
+    run(*flags, "--save-model", cwd=tmp_path, script=GAIL)
+    assert (tmp_path / "run" / "evaluation.json").read_bytes() == before
+    assert (tmp_path / "run" / "model.safetensors").exists()
+
+
+def test_a_clone_is_kept_where_it_is_stopped(expert, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    clone = gail.behaviour_cloning
+
+    def stopped(*args) -> None:
+        clone(*args)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(gail, "behaviour_cloning", stopped)
+    flags = [*map(str, SMALL_GAIL), "--demos-rl", str(expert / "demos"), "--total-timesteps", "0", "--run-dir", "run"]
+    assert gail.cli(flags) == 128 + signal.SIGTERM and "before the evaluation" in capsys.readouterr().out
+    assert (tmp_path / "run" / "checkpoint.pt").exists() and not (tmp_path / "run" / "result.json").exists()
+    run(*flags, "--resume", cwd=tmp_path, script=GAIL)  # in a process of its own, which has the folder's lock
+    assert (tmp_path / "run" / "result.json").exists()
 
 
 @pytest.mark.parametrize("flag", ["--seeds", "--workers"])
@@ -321,7 +350,7 @@ def test_gail_on_hopper_names_a_wrong_count(flag, monkeypatch, capsys):
 
 @pytest.mark.parametrize("steps", [512, 0])
 def test_a_resume_with_other_demonstrations_is_refused(steps, expert, tmp_path, monkeypatch, capsys):
-    """Of a student, and of a clone, which has no checkpoint."""
+    """Of a student, and of a clone."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(expert / "demos", "demos")
     flags = [*SMALL_GAIL, "--total-timesteps", steps, "--alpha", 1, "--demos-rl", "demos", "--run-dir", "run"]
