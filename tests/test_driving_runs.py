@@ -18,7 +18,18 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from conftest import ROOT, assert_refused, command, edit_manifest, flip_a_byte, kill_twice, needs_compiler, rewrite, run
+from conftest import (
+    ROOT,
+    as_a_process_of_its_own,
+    assert_refused,
+    command,
+    edit_manifest,
+    flip_a_byte,
+    kill_twice,
+    needs_compiler,
+    rewrite,
+    run,
+)
 
 from cleanrl_thesis import ddpg_torcs_like as ddpg
 from cleanrl_thesis import gail_hybrid as gail
@@ -332,9 +343,11 @@ def test_a_clone_is_kept_where_it_is_stopped(expert, tmp_path, monkeypatch, caps
 
     monkeypatch.setattr(gail, "behaviour_cloning", stopped)
     flags = [*map(str, SMALL_GAIL), "--demos-rl", str(expert / "demos"), "--total-timesteps", "0", "--run-dir", "run"]
-    assert gail.cli(flags) == 128 + signal.SIGTERM and "before the evaluation" in capsys.readouterr().out
+    with as_a_process_of_its_own():
+        assert gail.cli(flags) == 128 + signal.SIGTERM
+    assert "before the evaluation" in capsys.readouterr().out
     assert (tmp_path / "run" / "checkpoint.pt").exists() and not (tmp_path / "run" / "result.json").exists()
-    run(*flags, "--resume", cwd=tmp_path, script=GAIL)  # in a process of its own, which has the folder's lock
+    run(*flags, "--resume", cwd=tmp_path, script=GAIL)
     assert (tmp_path / "run" / "result.json").exists()
 
 
