@@ -26,9 +26,7 @@ UNITS = {  # a score of each episode, or of each of its lives
     "rewards of a game": lambda method, episode: [(episode["rewards"] > 0).sum()],
     "rewards of a life": lambda method, episode: method.rewards_per_life(episode),
 }
-QUICK = {
-    "reaction": 2
-}  # of the last four frames it needs the second and the third, where the calibrated one needs what was before
+QUICK = {"reaction": 2}  # what it acts on is among the four frames that a student sees
 CALIBRATION = {
     "reaction": (3, 4, 5),
     "aim_error": (2.0, 3.0, 4.0),

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from apple_report import interval, with_interval
+from apple_report import interval, representative_alpha, with_interval
 from common import ROOT, UsageError, commit, commit_of, published_table, run_main, write_csv
 from matplotlib.figure import Figure
 
@@ -182,11 +182,6 @@ def alpha_curve(rows: list[dict], mode: str) -> dict[float, list[float]]:
     return dict(sorted(curve.items()))
 
 
-def representative_alpha(curve: dict[float, list[float]], human: float) -> float | None:
-    """The thesis' rule: the smallest α tried above 0 whose score is better than the human's."""
-    return min((alpha for alpha, scores in curve.items() if alpha > 0 and np.mean(scores) > human), default=None)
-
-
 def alpha_table(rows: list[dict]) -> str:
     """Fig. 2.8 in numbers, in brackets the number of seeds, and the α that the thesis' rule picks."""
     curves = {mode: alpha_curve(rows, mode) for mode in MODES}
@@ -195,7 +190,8 @@ def alpha_table(rows: list[dict]) -> str:
         cells = [f"{with_interval(curves[mode][alpha], 1)} ({len(curves[mode][alpha])})" for mode in MODES]
         lines.append(f"| {alpha} | {' | '.join(cells)} |")
     human = mean_score(rows, "human")
-    picked = [representative_alpha(curves[mode], human) for mode in MODES]
+    by_seed = [{alpha: dict(enumerate(scores)) for alpha, scores in curves[mode].items()} for mode in MODES]
+    picked = [representative_alpha(curve, human) for curve in by_seed]
     lines.append(f"| rule picks | {' | '.join('none' if alpha is None else str(alpha) for alpha in picked)} |")
     return "\n".join(lines) + "\n"
 

@@ -874,7 +874,7 @@ def check_disk(args: Args, flag: str, value: int, size: int) -> None:
     except OSError:
         return  # of a folder that cannot be: `open_run_dir` says so
     allowed = f"its replay takes {size / 1e9:,.1f} GB of disk, {disk.free / 1e9:,.1f} are left"
-    require(begun or size <= disk.free or disk.total == 0, flag, value, allowed)
+    require(begun or size <= disk.free, flag, value, allowed)
 
 
 def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:

@@ -871,6 +871,7 @@ def make_app(args: Args, clips: list[Clip]):
 
     @app.get("/clip/{address}")
     def show_clip(address: str, request: Request) -> Response:
+        """The clip at an address; 503 where its file cannot be read, for which the page asks again."""
         sha256 = clip_file(args.db, address)
         if sha256 not in paths:
             raise HTTPException(404)
@@ -878,7 +879,7 @@ def make_app(args: Args, clips: list[Clip]):
             content = paths[sha256].read_bytes()
         except OSError as error:
             print(f"error: --videos {paths[sha256]}: {error.strerror}", file=sys.stderr, flush=True)
-            raise HTTPException(503, "cannot be read") from None  # the page asks again until it can
+            raise HTTPException(503, "cannot be read") from None
         return video_response(content, request.headers.get("range"))
 
     return app

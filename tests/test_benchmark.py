@@ -156,46 +156,9 @@ def test_direction_changes_do_not_count_standing_still():
     assert math.isclose(apple.direction_changes_per_second([episode, episode]), 2 * 60 / 10)
 
 
-def test_the_rule_picks_the_smallest_alpha_that_beats_the_human():
-    scores = {0.0: (20.0, 20.0), 0.5: (12.0, 13.0), 0.8: (19.0, 18.9), 0.93: (21.0, 17.0), 1.0: (30.0, 31.0)}
-    curve = {alpha: dict(enumerate(pair)) for alpha, pair in scores.items()}
-    assert apple.representative_alpha(curve, 18.71) == 0.8
-    assert apple.representative_alpha(curve, 40.0) is None
-
-
-def test_a_curve_has_the_runs_of_its_temperature():
-    rows = [
-        {"kind": kind, "alpha": alpha, "temperature": temperature, "mode": mode, "mean": mean, "seed": 1}
-        for kind, alpha, temperature, mode, mean in [
-            ("alpha0.0", 0.0, 0.01, "sampled", 1),
-            ("alpha0.5", 0.5, 0.01, "sampled", 2),
-            ("alpha0.5", 0.5, 0.01, "greedy", 3),
-            ("T1_alpha0.5", 0.5, 1.0, "sampled", 4),
-            ("own_alpha0.5", 0.5, 0.01, "sampled", 5),
-            ("quick_T2_alpha0.5", 0.5, 2.0, "sampled", 6),
-        ]
-    ]
-    assert apple.alpha_curve(rows, "sampled") == {0.0: {1: 1}, 0.5: {1: 2}}
-    assert apple.alpha_curve(rows, "sampled", 1.0) == {0.0: {1: 1}, 0.5: {1: 4}}
-    assert apple.alpha_curve(rows, "sampled", 2.0, "quick_") == {0.5: {1: 6}}
-    assert apple.temperatures(rows) == [0.01, 1.0]
-
-
-def test_differences_are_of_the_seeds_that_both_have():
-    first, second = {1: 3.0, 2: 5.0, 3: 9.0}, {3: 1.0, 1: 2.0, 4: 50.0}
-    assert apple.paired_difference(first, second) == f"{4.5:+.1f} ± {stats.t.ppf(0.975, 1) * 3.5:.1f}"
-
-
-def test_interval_of_the_seeds_is_that_of_the_t_distribution():
-    mean, half = apple.interval([1.0, 2.0, 3.0, 4.0, 5.0])
-    low, high = stats.t.interval(0.95, 4, loc=3.0, scale=math.sqrt(2.5 / 5))
-    assert math.isclose(mean - half, low) and math.isclose(mean + half, high)
-
-
-# Driving
 def test_the_rule_picks_the_smallest_alpha_above_the_human():
-    curve = {0.0: [9.0], 0.3: [4.0, 5.0], 0.5: [6.0, 5.0], 0.7: [8.0]}
-    assert torcs.representative_alpha(curve, 5.0) == 0.5 and torcs.representative_alpha(curve, 9.0) is None
+    curve = {0.0: {1: 9.0}, 0.3: {1: 4.0, 2: 5.0}, 0.5: {1: 6.0, 2: 5.0}, 0.7: {1: 8.0}}
+    assert apple.representative_alpha(curve, 5.0) == 0.5 and apple.representative_alpha(curve, 9.0) is None
 
 
 def test_marks_of_the_road_are_passed_once_a_lap():
