@@ -462,6 +462,11 @@ def test_a_lost_replay_buffer_is_not_taken_for_an_empty_one(tmp_path):
     assert "replay.dat" in done.stderr and done.stderr.count("\n") == 1
 
 
+def test_a_folder_that_cannot_be_is_named_and_not_its_disk(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(dqn, capsys, ["--run-dir", "x" * 300], ["--run-dir", "cannot be used"])
+
+
 def test_a_resume_may_take_other_threads(tmp_path):
     """For the last few updates, because threads that wait for one another spin, and tests have others beside them."""
     run(*SMALL, "--stop-at", 19_200, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
