@@ -116,7 +116,7 @@ class Args:
     resume: bool = False
     """go on from the checkpoint in `--run-dir`; start where there is none"""
     checkpoint_interval: int = 100_000
-    """steps between checkpoints; the replay file has room for as many transitions twice beyond `--buffer-size`"""
+    """steps between checkpoints; the replay file has room for two intervals beyond `--buffer-size`"""
     stop_at: int | None = None
     """end at this step of the full schedule; `--resume` can finish the run later"""
 
@@ -374,7 +374,10 @@ class Track:
 
 
 def across_straight(cosine, sine, along, left, length, sign, radius, half_width):
-    """Follow rays in straights: way to the road's edge, way to the segment's end, and the rays' `left`, cosine and sine there."""
+    """Follow rays in straights: way to the road's edge, way to the segment's end, and the rays' `left`, cosine and sine there.
+
+    All are (M, R) or broadcast to it; `sign` and `radius` are those of `across_arc`, which is called alike.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         wall = (np.copysign(half_width, sine) - left) / sine
         leave = np.where(cosine >= 0, length - along, along) / np.abs(cosine)
@@ -778,15 +781,17 @@ def draw_car(cars: Cars, car: int, side: int = 480) -> np.ndarray:
 
 def make_env(env_id: str, render_mode: str | None = None, **options) -> gym.Env:
     """Make an environment with flat `Box` observations and bounded `Box` actions. Raises UsageError."""
+    drawn = {} if render_mode is None else {"render_mode": render_mode}  # not every environment knows the word
     try:
-        env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True, **options)
-    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
+        env = gym.make(env_id, disable_env_checker=True, **drawn, **options)
+    except (gym.error.Error, AttributeError, ImportError, OSError, TypeError, ValueError) as error:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     space, actions = env.observation_space, env.action_space
     is_flat = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
     require(is_flat, "--env-id", env_id, f"needs flat Box observations, this one has {space}")
     is_bounded = isinstance(actions, gym.spaces.Box) and len(actions.shape) == 1 and actions.is_bounded()
-    require(is_bounded, "--env-id", env_id, f"needs bounded flat Box actions, this one has {actions}")
+    is_bounded = is_bounded and np.issubdtype(actions.dtype, np.floating)
+    require(is_bounded, "--env-id", env_id, f"needs bounded flat Box actions of floats, this one has {actions}")
     return env
 
 
@@ -1227,14 +1232,14 @@ class Best:
     def __init__(self, optimizer: "FlatAdam", norm: RunningNorm):
         self.optimizer, self.norm = optimizer, norm
         self.vector, self.scale = optimizer.vector.clone(), norm.scale.clone()
-        self.step, self.score, self.last_score = 0, -math.inf, math.nan
+        self.step, self.score, self.last_mean_return = 0, -math.inf, math.nan
 
     def consider(self, args: Args, space: gym.spaces.Box, step: int) -> None:
-        """Evaluate the present policy, and keep it where none was better; `last_score` is the mean of its returns."""
+        """Evaluate the present policy, and keep it where none was better; `last_mean_return` is the mean of its returns."""
         seeds = [episode_seed(args.seed, SELECTION_STREAM, i) for i in range(SELECTION_EPISODES)]
         policy = held(make_policy(self.optimizer, self.norm, space), args.frame_skip)
         returns = [episode["rewards"].sum() for episode in play(policy, make_games(args, len(seeds)), seeds)]
-        self.last_score, score = float(np.mean(returns)), float(np.mean(returns) - np.std(returns))
+        self.last_mean_return, score = float(np.mean(returns)), float(np.mean(returns) - np.std(returns))
         if score >= self.score:
             self.step, self.score = step, score
             self.vector.copy_(self.optimizer.vector)
@@ -1247,13 +1252,13 @@ class Best:
             self.norm.set_scale(self.scale)
 
     def state_dict(self) -> dict:
-        names = ("vector", "scale", "step", "score", "last_score")
+        names = ("vector", "scale", "step", "score", "last_mean_return")
         return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict) -> None:
         self.vector.copy_(state["vector"])
         self.scale.copy_(state["scale"])
-        self.step, self.score, self.last_score = state["step"], state["score"], state["last_score"]
+        self.step, self.score, self.last_mean_return = state["step"], state["score"], state["last_mean_return"]
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -1338,7 +1343,7 @@ class FlatAdam:
 def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float, eps: float) -> None:
     """Clip the gradient's norm and take one step of Adam; changes the first four in place.
 
-    All tensors are of shape (P,) but `step`, which counts and is a scalar, and `rates`, which may be one too.
+    All tensors are (P,), but `step`, a scalar that counts the steps, and `rates`, (P,) or a scalar.
     """
     gradient = gradient * (max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0)
     step.add_(1)
@@ -1433,7 +1438,7 @@ class Update:
 # ---------------------------------------------------------------------------------------------------------------------
 # The run's folder and its checkpoints
 # ---------------------------------------------------------------------------------------------------------------------
-CHECKPOINT_FORMAT = "ddpg_torcs_like 2"
+CHECKPOINT_FORMAT = "ddpg_torcs_like 3"
 SCRIPT_SHA256 = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()  # now, for the file may change while it runs
 FINISH = ("eval_episodes", "capture_video", "save_model", "save_demos")
 # not checkpoint_interval: the size of replay.dat follows from it
@@ -1469,7 +1474,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -1530,7 +1535,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -1549,6 +1554,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -1561,11 +1568,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -1631,12 +1638,22 @@ MAX_EVALUATION_STEPS = 100_000  # of an episode, where the environment has no ti
 WINDOW = 5 * FPS  # steps in a window of the driving score, 5 s
 
 
+class WithoutInfos(gym.Wrapper):
+    """Drops infos, which `SyncVectorEnv` stacks, and cannot where they differ in kind or shape."""
+
+    def reset(self, **kwargs) -> tuple[np.ndarray, dict]:
+        return super().reset(**kwargs)[0], {}
+
+    def step(self, action) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return *super().step(action)[:4], {}
+
+
 def make_games(args: Args, num_envs: int) -> gym.vector.VectorEnv:
     """Environments side by side: the driving task's own, scored by distance whatever the reward, or copies in turn."""
     if is_driving(args.env_id):
         return TorcsLikeVectorEnv(num_envs, track=args.track_name, brake=args.brake)
     same_step = gym.vector.AutoresetMode.SAME_STEP
-    return gym.vector.SyncVectorEnv([lambda: make_env(args.env_id)] * num_envs, autoreset_mode=same_step)
+    return gym.vector.SyncVectorEnv([lambda: WithoutInfos(make_env(args.env_id))] * num_envs, autoreset_mode=same_step)
 
 
 def play(policy, games: gym.vector.VectorEnv, seeds: list[int], keep: bool = False) -> list[dict[str, np.ndarray]]:
@@ -1895,7 +1912,7 @@ def main(args: Args) -> int:
     if args.track:
         start_wandb(args, run_dir)
 
-    random.seed(args.seed)  # this file draws from neither; of environments that do, resumed runs end with other bytes
+    random.seed(args.seed)  # for environments that draw from these two; their resumed runs end with other bytes
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
@@ -1993,7 +2010,7 @@ def main(args: Args) -> int:
         training_seconds, last_time = training_seconds + now - last_time, now
         if logs:
             metrics = {**means.take(), "charts/noise_size": explorer.size, "charts/noise_distance": noise_distance}
-            metrics["charts/selection_return"] = best.last_score
+            metrics["charts/selection_return"] = best.last_mean_return
             updates_csv.write({"global_step": global_step, **metrics})
             add_scalars(writer, {**metrics, "charts/SPS": global_step / training_seconds}, global_step)
         if crossed or stop.received or iteration == last_iteration:

@@ -119,9 +119,9 @@ class Args:
     save_demos: int = 0
     """episodes of the student to write into `demos/`, one .npz each and a manifest"""
     eval_episodes: int | None = None
-    """episodes of the evaluation at the end, sampled and greedy; default: 400 (Table 2.1), Atari 100"""
+    """episodes of the evaluation at the end, sampled and greedy; default: 400 (section 2.4.1), Atari 100"""
     eval_mode: Literal["sampled", "greedy"] = "sampled"
-    """whether video and demonstrations sample from the policy or take its most probable action, in Atari but for 1% random ones"""
+    """mode of video and demonstrations: sample from the policy, or take its most probable action (in Atari with 1% random ones)"""
     run_dir: Path | None = None
     """the run's folder; default: runs/{env_id}__{exp_name}__{seed}__{unix time}"""
     resume: bool = False
@@ -134,7 +134,7 @@ class Args:
     # Algorithm
     env_id: str = "AppleGame-v0"
     """the environment: AppleGame-v0, ALE/Gopher-v5, or with `--demos` another ALE/*-v5 or a Gymnasium id with flat Box or
-    image observations (channels first, uint8) and Discrete actions"""
+    image observations (channels first, uint8) and Discrete actions; flat ones enter as they are, best within about ±1"""
     teacher: Path | None = None
     """folder of the DQN's run, with `model.safetensors`; needed for α > 0"""
     demos: Path | None = None
@@ -422,8 +422,9 @@ ATARI_FPS = 60  # the console's frames a second
 class AtariGame(gym.Env):
     """A game of ale-py as Mnih et al. (2015) show it: the last frames that the agent saw, newest last.
 
-    Observations are (frame_stack, 84, 84) uint8, or of `ram` (frame_stack, 128): equal to Gymnasium's
-    `FrameStackObservation(AtariPreprocessing(gym.make(env_id, frameskip=1), noop_max, frame_skip), frame_stack)`.
+    Observations are (frame_stack, 84, 84) uint8, equal to Gymnasium's
+    `FrameStackObservation(AtariPreprocessing(gym.make(env_id, frameskip=1), noop_max, frame_skip), frame_stack)`,
+    or of `ram` the console's memory at the same steps, (frame_stack, 128).
     An episode follows from the seed of its reset and its actions. The end after 30 minutes is a truncation.
     """
 
@@ -462,7 +463,7 @@ class AtariGame(gym.Env):
             self.emulator.loadROM(self.rom)
         self.emulator.reset_game()
         for _ in range(self.np_random.integers(1, self.noop_max + 1) if self.noop_max else 0):
-            self.emulator.act(self.moves[0])
+            self.emulator.act(ale_py.Action.NOOP)
             if self.emulator.game_over():
                 self.emulator.reset_game()
         self.lives = self.emulator.lives()
@@ -528,9 +529,10 @@ def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
     """Make an environment with flat `Box` or image observations and `Discrete` actions. Raises UsageError."""
     if is_atari(env_id):
         return make_atari(env_id, render_mode)
+    drawn = {} if render_mode is None else {"render_mode": render_mode}  # not every environment knows the word
     try:
-        env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True)
-    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
+        env = gym.make(env_id, disable_env_checker=True, **drawn)
+    except (gym.error.Error, AttributeError, ImportError, OSError, TypeError, ValueError) as error:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     space, actions = env.observation_space, env.action_space
     is_flat = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
@@ -852,6 +854,7 @@ def draw_masks(shape: tuple[int, int, int], dropout: float) -> torch.Tensor:
 # ---------------------------------------------------------------------------------------------------------------------
 EVALUATION_STREAM, DEMONSTRATION_STREAM = 1_000_000, 1_000_001
 HUMAN_STREAM = 1_000_002
+STUDENT_STREAM = 1_000_003  # of its demonstrations: other episodes than the teacher's, 1_000_001
 
 
 @functools.lru_cache
@@ -913,6 +916,9 @@ def read_episode(path: Path, checksum: str, env: gym.Env, frame_skip: int = ATAR
         seeded = seed.shape == () and np.issubdtype(seed.dtype, np.integer) and seed >= 0
         allowed = "needs actions (T,), and as seed a whole number from 0 on"
         require(actions.ndim == 1 and bool(seeded), "--demos", path, allowed)
+        lives = episode["lives"]
+        counted = lives.shape == actions.shape and np.issubdtype(lives.dtype, np.integer)
+        require(counted, "--demos", path, "lives must be whole numbers (T,)")
         episode["observations"] = watch(env, episode) if frame_skip == ATARI_SKIP else watch_frames(env, episode)
         allowed = "gives other rewards when it is played again: of another version of ale-py?"
         require(episode["observations"] is not None, "--demos", path, allowed)
@@ -1100,7 +1106,7 @@ def views(vector: torch.Tensor, shapes: list[torch.Size]) -> list[torch.Tensor]:
 def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float, eps: float) -> None:
     """Clip the gradient's norm and take one step of Adam; changes the first four in place.
 
-    All tensors are of shape (P,) but `step`, which counts and is a scalar, and `rates`, which may be one too.
+    All tensors are (P,), but `step`, a scalar that counts the steps, and `rates`, (P,) or a scalar.
     """
     gradient = gradient * (max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0)
     step.add_(1)
@@ -1228,7 +1234,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -1277,7 +1283,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -1296,6 +1302,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -1313,11 +1321,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -1382,12 +1390,22 @@ class StopSignal:
 MAX_EVALUATION_STEPS = 100_000  # of an episode, where the environment has no time limit
 
 
+class WithoutInfos(gym.Wrapper):
+    """Drops infos, which `SyncVectorEnv` stacks, and cannot where they differ in kind or shape."""
+
+    def reset(self, **kwargs) -> tuple[np.ndarray, dict]:
+        return super().reset(**kwargs)[0], {}
+
+    def step(self, action) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return *super().step(action)[:4], {}
+
+
 def make_games(env_id: str, num_envs: int) -> gym.vector.VectorEnv:
     """Environments side by side: the Apple game's own vectorised one, else copies stepped in turn."""
     if env_id.split(":")[-1] == "AppleGame-v0":
         return AppleGameVectorEnv(num_envs)
     same_step = gym.vector.AutoresetMode.SAME_STEP
-    return gym.vector.SyncVectorEnv([lambda: make_env(env_id)] * num_envs, autoreset_mode=same_step)
+    return gym.vector.SyncVectorEnv([lambda: WithoutInfos(make_env(env_id))] * num_envs, autoreset_mode=same_step)
 
 
 def play(policy, env_id: str, seeds: list[int], frame_skip: int = 1, keep: bool = False) -> list[dict[str, np.ndarray]]:
@@ -1522,8 +1540,8 @@ def play_student(student: Student, mode: str, args: Args, seeds: list[int], keep
 def evaluate(student: Student, update: Update, networks: dict[str, torch.Tensor], args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes with each network in each mode; write `evaluation.json` and, if asked, a video.
 
-    `networks` are vectors of parameters by what is put before the mode's name; the student is left with the last.
-    Where both are the same network, it plays once.
+    `networks` are vectors of parameters (P,), by the prefix of their entries: `last_` for the last epoch's, none for the
+    kept one's. The student is left with the last of them. Where both are the same network, it plays once.
     """
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
     evaluation = {"env_id": args.env_id, "seeds": seeds}
@@ -1554,7 +1572,7 @@ def summary(returns: list[float] | np.ndarray) -> dict[str, float | None]:
 
 def save_demonstrations(student: Student, args: Args, run_dir: Path) -> None:
     """Write `--save-demos` episodes of the student into `demos/`."""
-    seeds = [episode_seed(args.seed, DEMONSTRATION_STREAM, i) for i in range(args.save_demos)]
+    seeds = [episode_seed(args.seed, STUDENT_STREAM, i) for i in range(args.save_demos)]
     episodes = play_student(student, args.eval_mode, args, seeds, keep=True)
     about = {"env_id": args.env_id, "player": f"{args.exp_name}, alpha {args.alpha}", "mode": args.eval_mode}
     save_episodes(run_dir / "demos", episodes, about)
@@ -1754,7 +1772,7 @@ def main(args: Args) -> int:
         about = {"env_id": args.env_id, "player": "synthetic human", "mode": "scripted"}
         save_episodes(run_dir / "demos_synthetic_human", human_episodes, about)
 
-    random.seed(args.seed)  # this file draws from neither; of environments that do, resumed runs end with other bytes
+    random.seed(args.seed)  # for environments that draw from these two; their resumed runs end with other bytes
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic

@@ -105,7 +105,7 @@ class Args:
     save_demos: int = 0
     """episodes of the trained agent to write into `demos/`, one .npz each and a manifest"""
     eval_episodes: int = 400
-    """episodes of the evaluation at the end, with the greedy policy (Table 2.1)"""
+    """episodes of the evaluation at the end, with the greedy policy (section 2.4.1)"""
     run_dir: Path | None = None
     """the run's folder; default: runs/{env_id}__{exp_name}__{seed}__{unix time}"""
     resume: bool = False
@@ -403,9 +403,10 @@ if "AppleGame-v0" not in gym.registry:
 
 def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
     """Make an environment with flat `Box` observations and `Discrete` actions. Raises UsageError."""
+    drawn = {} if render_mode is None else {"render_mode": render_mode}  # not every environment knows the word
     try:
-        env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True)
-    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
+        env = gym.make(env_id, disable_env_checker=True, **drawn)
+    except (gym.error.Error, AttributeError, ImportError, OSError, TypeError, ValueError) as error:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     space, actions = env.observation_space, env.action_space
     is_flat = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
@@ -702,7 +703,7 @@ class FlatAdam:
 def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float, eps: float) -> None:
     """Clip the gradient's norm and take one step of Adam; changes the first four in place.
 
-    All tensors are of shape (P,) but `step`, which counts and is a scalar, and `rates`, which may be one too.
+    All tensors are (P,), but `step`, a scalar that counts the steps, and `rates`, (P,) or a scalar.
     """
     gradient = gradient * (max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0)
     step.add_(1)
@@ -829,7 +830,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -890,7 +891,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -909,6 +910,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -921,11 +924,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -990,12 +993,22 @@ class StopSignal:
 MAX_EVALUATION_STEPS = 100_000  # of an episode, where the environment has no time limit
 
 
+class WithoutInfos(gym.Wrapper):
+    """Drops infos, which `SyncVectorEnv` stacks, and cannot where they differ in kind or shape."""
+
+    def reset(self, **kwargs) -> tuple[np.ndarray, dict]:
+        return super().reset(**kwargs)[0], {}
+
+    def step(self, action) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return *super().step(action)[:4], {}
+
+
 def make_games(env_id: str, num_envs: int) -> gym.vector.VectorEnv:
     """Environments side by side: the Apple game's own vectorised one, else copies stepped in turn."""
     if env_id.split(":")[-1] == "AppleGame-v0":
         return AppleGameVectorEnv(num_envs)
     same_step = gym.vector.AutoresetMode.SAME_STEP
-    return gym.vector.SyncVectorEnv([lambda: make_env(env_id)] * num_envs, autoreset_mode=same_step)
+    return gym.vector.SyncVectorEnv([lambda: WithoutInfos(make_env(env_id))] * num_envs, autoreset_mode=same_step)
 
 
 def play(policy, env_id: str, seeds: list[int], frame_skip: int = 1, keep: bool = False) -> list[dict[str, np.ndarray]]:
@@ -1214,7 +1227,7 @@ def main(args: Args) -> int:
     if args.track:
         start_wandb(args, run_dir)
 
-    random.seed(args.seed)  # this file draws from neither; of environments that do, resumed runs end with other bytes
+    random.seed(args.seed)  # for environments that draw from these two; their resumed runs end with other bytes
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic

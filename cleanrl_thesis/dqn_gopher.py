@@ -130,7 +130,7 @@ class Args:
     frame_skip: int = 4
     """frames for which an action is repeated"""
     frame_stack: int = 4
-    """the last frames that the agent saw, which it sees together"""
+    """frames that are stacked into one observation"""
     noop_max: int = 30
     """most idle frames at the start of an episode"""
     learning_rate: float = 1e-4
@@ -144,7 +144,7 @@ class Args:
     gamma: float = 0.99
     """discount factor γ per action (Baselines)"""
     n_step: int = 1
-    """actions whose rewards a target sums up before it asks the target network (Baselines: 1)"""
+    """actions whose rewards are summed before the value of the next state (Baselines: 1)"""
     target_network_frequency: int = 4_000
     """frames between updates of the target network (Baselines)"""
     batch_size: int = 32
@@ -168,7 +168,7 @@ class Args:
     clip_rewards: bool = True
     """learn from the rewards' signs (Baselines)"""
     life_loss_ends: bool = False
-    """no value behind the loss of a life (on in Baselines)"""
+    """learn as if the loss of a life ended the episode (on in Baselines)"""
 
     # to be filled in runtime
     num_iterations: tyro.conf.Suppress[int] = 0
@@ -257,8 +257,9 @@ ATARI_FPS = 60  # the console's frames a second
 class AtariGame(gym.Env):
     """A game of ale-py as Mnih et al. (2015) show it: the last frames that the agent saw, newest last.
 
-    Observations are (frame_stack, 84, 84) uint8, or of `ram` (frame_stack, 128): equal to Gymnasium's
-    `FrameStackObservation(AtariPreprocessing(gym.make(env_id, frameskip=1), noop_max, frame_skip), frame_stack)`.
+    Observations are (frame_stack, 84, 84) uint8, equal to Gymnasium's
+    `FrameStackObservation(AtariPreprocessing(gym.make(env_id, frameskip=1), noop_max, frame_skip), frame_stack)`,
+    or of `ram` the console's memory at the same steps, (frame_stack, 128).
     An episode follows from the seed of its reset and its actions. The end after 30 minutes is a truncation.
     """
 
@@ -297,7 +298,7 @@ class AtariGame(gym.Env):
             self.emulator.loadROM(self.rom)
         self.emulator.reset_game()
         for _ in range(self.np_random.integers(1, self.noop_max + 1) if self.noop_max else 0):
-            self.emulator.act(self.moves[0])
+            self.emulator.act(ale_py.Action.NOOP)
             if self.emulator.game_over():
                 self.emulator.reset_game()
         self.lives = self.emulator.lives()
@@ -639,9 +640,7 @@ class Learner:
         self.optimizer = torch.optim.Adam(self.agent.parameters(), args.learning_rate, eps=1e-8, fused=True)
 
     def copy_to_target(self) -> None:
-        with torch.no_grad():
-            for target, online in zip(self.target_network.parameters(), self.agent.parameters()):
-                target.copy_(online)
+        self.target_network.load_state_dict(self.agent.state_dict())
 
     def update(self, minibatch: Minibatch, learning_rate: float) -> tuple[torch.Tensor, ...]:
         """One step of Adam; returns as scalars the TD error's size and the mean Q."""
@@ -714,7 +713,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -775,7 +774,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -794,6 +793,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -806,11 +807,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 

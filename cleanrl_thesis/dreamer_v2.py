@@ -17,8 +17,8 @@ author.
 | state | deter 600, 32 × 32 classes | deter 128, 16 × 32 classes |
 | image | pixels / 255 − 0.5, weight 1 | mean frame subtracted, channels of unit size, weight 0.25 |
 | KL | scale 0.1 | scale 1 after a warm-up of 1,000 updates: at 0.1 it pays to ignore the agent, a few pixels |
-| codes | | their entropy counts at first: without it some seeds see the goal alone for hundreds of updates; a whole run did as well * |
-| batches | 16 × 50, all states start a dream | 24 × 10, 64 states start one; a tenth of the chunks hold a reward: drawn from anywhere they had taught nothing after 60,000 steps * |
+| codes | no bonus for their entropy | a bonus during the warm-up: without it codes of some seeds show the goal alone for hundreds of updates; a whole run without it did as well * |
+| batches | 16 × 50, all states start a dream | 24 × 10, 64 states start one; a tenth of the chunks hold a reward: with all drawn from anywhere nothing was learned in 60,000 steps * |
 | γ | 0.999 | 0.95: the frame does not show the time that a reward depends on, so only γ makes the agent hurry; at 0.99 a wrong value lives long, for states that see no reward learn it from each other |
 | Adam's ε | 1e-5 | 1e-8 for actor and critic; 1e-5 did as well * |
 | random play at first | 50,000 steps | 1,000,000 steps, with a reward or more at each of 64 goal cells; after 200,000 there are 10 to 17 without one, which are never sought |
@@ -52,6 +52,7 @@ import functools
 import hashlib
 import importlib.util
 import io
+import itertools
 import json
 import math
 import os
@@ -140,8 +141,8 @@ class Args:
     chunk_length: int | None = None
     """steps of a chunk; episodes follow each other in it (DreamerV2)"""
     rewarded_share: float | None = None
-    """share of the chunks that hold a reward, where there is one, and above 0 one chunk at least; all others are drawn from
-    anywhere (ours)"""
+    """share of a batch's chunks that are drawn so that they hold a reward, above 0 at least one chunk, as soon as the replay holds a
+    reward; the others are drawn from anywhere (ours)"""
     starts: int | None = None
     """states of a batch at which dreams start, at most (DreamerV2: all)"""
     horizon: int = 15
@@ -177,8 +178,8 @@ class Args:
     kl_scale: float | None = None
     """weight of the KL divergence (DreamerV2)"""
     entropy_scale: float | None = None
-    """weight of the entropy of the codes at first, to none over `--kl-warmup`; without it the goal, which is learned first, takes
-    all codes, sharp ones that learn little more, and some seeds do not see the agent for hundreds of updates (ours)"""
+    """weight of a bonus for the entropy of the codes, annealed to 0 over `--kl-warmup`; without it the codes become sharp on the
+    goal, which is learned first, and some seeds do not see the agent for hundreds of updates (ours)"""
     kl_warmup: int | None = None
     """updates over which the weight of the KL divergence grows from a tenth (ours)"""
     kl_balance: float = 0.8
@@ -373,7 +374,7 @@ class Maze:
 
 
 def area_weights(length: int, side: int) -> np.ndarray:
-    """The matrix (side, length) that shrinks a line of pixels by averaging, each weighed by the part that is covered."""
+    """The matrix (side, length) that shrinks a line of pixels by averaging, each weighted by the part of it that is covered."""
     edges = np.linspace(0, length, side + 1)
     pixels = np.arange(length)
     covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
@@ -543,7 +544,7 @@ ROOM_SIZES = {"FourRooms11-v0": 11, "FourRooms19-v0": 19}  # cells of the maze's
 # ---------------------------------------------------------------------------------------------------------------------
 # The replay: the whole history, as numbers
 # ---------------------------------------------------------------------------------------------------------------------
-RECORD = np.dtype(  # a step of a game: where it arrived, by which action, and what for
+RECORD = np.dtype(  # a step of a game: the state that it led to, its action and its reward
     [("pose", "<u2"), ("goal", "<u2"), ("action", "u1"), ("first", "u1"), ("terminal", "u1"), ("reward", "<f4")]
 )
 
@@ -1092,6 +1093,10 @@ class Learner:
         chosen = alive[torch.randperm(len(alive))[: self.args.starts].to(alive.device)]
         return type(states)(*(part.detach().flatten(0, 1)[chosen] for part in states))
 
+    def is_finite(self) -> bool:
+        parameters = itertools.chain(self.model.parameters(), self.behaviour.parameters())
+        return all(bool(parameter.isfinite().all()) for parameter in parameters)
+
     def state_dict(self) -> dict:
         optimizers = {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()}
         modules = {"model": self.model.state_dict(), "behaviour": self.behaviour.state_dict()}
@@ -1306,7 +1311,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -1367,7 +1372,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -1386,6 +1391,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -1398,11 +1405,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -1538,7 +1545,7 @@ def fewest_steps(maze: Maze) -> np.ndarray:
 def evaluate(learner: Learner, args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes with seeds that training does not use, greedily; write `evaluation.json`, `dream.png` and videos.
 
-    `optimal` is the mean return of shortest ways from the same starts, `solved` the share of the goals that were reached.
+    `optimal` is the mean return of shortest paths from the same starts, `solved` the share of the goals that were reached.
     """
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
     with own_randomness(args.seed):
@@ -1639,7 +1646,7 @@ def plot_learning_curve(run_dir: Path, args: Args, evaluation: dict) -> None:
         axes.plot(steps[window - 1 :], means, color="tab:blue", label=f"mean of {window} episodes (sampled)")
     label = f"evaluation (greedy, {args.eval_episodes} episodes): {evaluation['mean']:.3f}"
     axes.axhline(evaluation["mean"], color="tab:orange", linestyle="--", label=label)
-    label = f"shortest ways from the same starts: {evaluation['optimal']:.3f}"
+    label = f"shortest paths from the same starts: {evaluation['optimal']:.3f}"
     axes.axhline(evaluation["optimal"], color="black", linestyle=":", label=label)
     axes.set_title(f"{args.env_id}, DreamerV2, size {args.size}, seed {args.seed}")
     axes.set_xlabel("environment steps")
@@ -1775,8 +1782,8 @@ def main(args: Args) -> int:
             compared = compare_dream(learner, args) if is_due else unknown
             metrics |= compared
             updates_csv.write({"global_step": global_step, "charts/episodic_return": mean_return, **metrics})
-            if not all(math.isfinite(value) for name, value in metrics.items() if name.startswith("losses/")):
-                raise RunError(f"step {global_step}: a loss is no longer finite ({metrics})")
+            if not learner.is_finite():
+                raise RunError(f"step {global_step}: the parameters are no longer finite (last metrics: {metrics})")
         seconds, last_time = time.perf_counter() - last_time, time.perf_counter()
         training_seconds += seconds
         add_scalars(writer, {**metrics, "charts/SPS": BLOCK / seconds}, global_step)

@@ -25,7 +25,7 @@ agent, and its score stands to the DDPG experts' as in Table 2.3. `--demos-human
 | an action is held, while driving | for 5 steps, 0.1 s, as by `ddpg_torcs_like.py` | ours; the study's code acts in each step |
 | penalty on the discriminator's gradient | 10 (`--d-grad-penalty 0`: Eq. 2.3.1 alone) | ours; the number is that of Gulrajani et al. 2017 |
 | start by behaviour cloning | 20 passes (`--bc-epochs 0`: none) | an option of the study's code |
-| Fisher matrix | from a fifth of a batch | OpenAI Baselines'; the full step is then too long and is halved, to the same scores |
+| Fisher matrix | from a fifth of a batch | OpenAI Baselines'; the full step is then often too long and is halved; the scores are the same |
 | actions that the discriminator sees | within the bounds | ours; the study's code shows them as sampled |
 | CG iterations, damping; γ, λ; passes over the value function, rate; entropies | 10, 0.1; 0.995, 0.97; 5, 1e-3; 0, 1e-3 | the study's code |
 | which label is the expert's | D → 0 | Eq. 2.3.1; the prose and the study's code have D and 1 − D swapped |
@@ -127,8 +127,8 @@ class Args:
 
     # Algorithm
     env_id: str = "TorcsLike-v0"
-    """the environment: TorcsLike-v0 or a Gymnasium id with flat Box observations and bounded Box actions (ours; section 2.4.3
-    has TORCS)"""
+    """the environment: TorcsLike-v0 or a Gymnasium id with flat Box observations and Box actions with bounds, best of about ±1: the
+    policy begins with a deviation of 1 (ours; section 2.4.3 has TORCS)"""
     track_name: str = "meadow"
     """the road of TorcsLike-v0: meadow, speedway, hills or city (ours, after roads of TORCS)"""
     brake: bool = True
@@ -189,9 +189,9 @@ class Args:
     reward_form: Literal["positive", "signed"] = "positive"
     """positive: −log D, with which it pays to survive (Eq. 2.3.1); signed: log(1 − D) − log D, with which it need not (ours)"""
     bc_epochs: int = 20
-    """passes over the human's demonstrations (at α = 1 the RL expert's) in which the policy first learns actions (behaviour
-    cloning); 0: none; with `--total-timesteps 0` that is all: between α = 0 and 1 both experts' actions are mixed into one mean, as
-    section 2.3.2 warns against (an option of the study's code)"""
+    """passes of behaviour cloning before GAIL, counted over the human's demonstrations (at α = 1 the RL expert's), 0 for none; both
+    experts' losses are weighted by α and 1 − α, which between 0 and 1 mixes their actions into one mean, as section 2.3.2 warns
+    against; with `--total-timesteps 0` nothing follows (an option of the study's code)"""
     hidden_size: int = 100
     """units in each of the two hidden layers of all networks (the study's code)"""
 
@@ -404,7 +404,10 @@ class Track:
 
 
 def across_straight(cosine, sine, along, left, length, sign, radius, half_width):
-    """Follow rays in straights: way to the road's edge, way to the segment's end, and the rays' `left`, cosine and sine there."""
+    """Follow rays in straights: way to the road's edge, way to the segment's end, and the rays' `left`, cosine and sine there.
+
+    All are (M, R) or broadcast to it; `sign` and `radius` are those of `across_arc`, which is called alike.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         wall = (np.copysign(half_width, sine) - left) / sine
         leave = np.where(cosine >= 0, length - along, along) / np.abs(cosine)
@@ -808,15 +811,17 @@ def draw_car(cars: Cars, car: int, side: int = 480) -> np.ndarray:
 
 def make_env(env_id: str, render_mode: str | None = None, **options) -> gym.Env:
     """Make an environment with flat `Box` observations and bounded `Box` actions. Raises UsageError."""
+    drawn = {} if render_mode is None else {"render_mode": render_mode}  # not every environment knows the word
     try:
-        env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True, **options)
-    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
+        env = gym.make(env_id, disable_env_checker=True, **drawn, **options)
+    except (gym.error.Error, AttributeError, ImportError, OSError, TypeError, ValueError) as error:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     space, actions = env.observation_space, env.action_space
     is_flat = isinstance(space, gym.spaces.Box) and len(space.shape) == 1
     require(is_flat, "--env-id", env_id, f"needs flat Box observations, this one has {space}")
     is_bounded = isinstance(actions, gym.spaces.Box) and len(actions.shape) == 1 and actions.is_bounded()
-    require(is_bounded, "--env-id", env_id, f"needs bounded flat Box actions, this one has {actions}")
+    is_bounded = is_bounded and np.issubdtype(actions.dtype, np.floating)
+    require(is_bounded, "--env-id", env_id, f"needs bounded flat Box actions of floats, this one has {actions}")
     return env
 
 
@@ -837,9 +842,10 @@ class SyntheticDriver:
 
     It looks at road and car now and then, and what it then decides reaches the hands a reaction time later. It steers for
     a point ahead of where the car will be by then, a little too much or too little, and corrects with the next look; it
-    slows down before curves and parked cars once they are in sight. Its numbers are guesses but for the boldness, with
-    which its mean on the road `meadow` is 475 (km/h) s, 0.78 of the DDPG expert's as in Table 2.3, of seed 1 without a crash
-    in 220 episodes (of five seeds 3 in 1,100). Its standard deviation is 12 to 14, there 31. On other roads it crashes more often.
+    slows down before curves and parked cars once they are in sight. Its numbers are guesses but for the boldness, which was
+    fitted: on the road `meadow` its mean is 475 (km/h) s, 0.78 of the DDPG expert's, as in Table 2.3 (seed 1; no crash in 220
+    episodes, of five seeds 3 in 1,100). Its standard deviation, 12 to 14, was not fitted (Table 2.3: 31). On other roads it
+    crashes more often.
     """
 
     look, look_spread = 7.0, 0.3  # median time between looks in steps of 0.02 s, and its standard deviation as a share
@@ -1238,7 +1244,13 @@ class Agent(nn.Module):
 
 
 def numpy_mean(agent: Agent):
-    """The policy's mean as a numpy function, (N, O) -> (N, A); shares the agent's memory on the CPU."""
+    """The policy's mean as a numpy function, (N, O) -> (N, A); shares the agent's memory on the CPU.
+
+    It is the twin of `Agent.actor_mean`: change both.
+    """
+    unknown = {type(module) for module in agent.actor_mean} - {nn.Linear, nn.Tanh}
+    if unknown:
+        raise TypeError(f"numpy_mean would leave out what is new in actor_mean: {unknown}")
     tensors = [(layer.weight.T, layer.bias) for layer in agent.actor_mean if isinstance(layer, nn.Linear)]
     layers = [[tensor.detach().cpu().numpy() for tensor in pair] for pair in tensors]
     obs_mean, obs_std = agent.obs_mean.cpu().numpy(), agent.obs_std.cpu().numpy()
@@ -1528,7 +1540,7 @@ def update_discriminator(
 
 
 def behaviour_cloning(agent: Agent, experts: Experts, args: Args) -> None:
-    """Fit the policy to the experts' actions, weighted as in Eq. 2.3.1: most likely under it (Adam, 3e-4, batches of 128)."""
+    """Maximise the likelihood of both experts' actions, weighted by α and 1 − α as in Eq. 2.3.1 (Adam, 3e-4, 128 steps of each)."""
     optimizer = torch.optim.Adam([*agent.actor_mean.parameters(), agent.actor_logstd], 3e-4, fused=True)
     for _ in range(args.bc_epochs * len(experts.human.obs) // 128):
         losses = []
@@ -1580,7 +1592,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -1629,7 +1641,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -1648,6 +1660,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -1668,11 +1682,11 @@ def learned_from(run_dir: Path, checkpoint: dict | None) -> str | None:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -1739,12 +1753,22 @@ WINDOW = 5 * FPS  # steps in a window of the driving score, 5 s
 MODES = ("sampled", "greedy")
 
 
+class WithoutInfos(gym.Wrapper):
+    """Drops infos, which `SyncVectorEnv` stacks, and cannot where they differ in kind or shape."""
+
+    def reset(self, **kwargs) -> tuple[np.ndarray, dict]:
+        return super().reset(**kwargs)[0], {}
+
+    def step(self, action) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return *super().step(action)[:4], {}
+
+
 def make_games(args: Args, num_envs: int) -> gym.vector.VectorEnv:
     """Environments side by side: the driving task's own, scored by distance whatever the reward, or copies in turn."""
     if is_driving(args.env_id):
         return TorcsLikeVectorEnv(num_envs, track=args.track_name, brake=args.brake)
     same_step = gym.vector.AutoresetMode.SAME_STEP
-    return gym.vector.SyncVectorEnv([lambda: make_env(args.env_id)] * num_envs, autoreset_mode=same_step)
+    return gym.vector.SyncVectorEnv([lambda: WithoutInfos(make_env(args.env_id))] * num_envs, autoreset_mode=same_step)
 
 
 def play(policy, games: gym.vector.VectorEnv, seeds: list[int], keep: bool = False) -> list[dict[str, np.ndarray]]:
@@ -2024,7 +2048,7 @@ def main(args: Args) -> int:
         write_demonstrations(run_dir / "demos_synthetic_human", human, about)
     del human, rl  # the arrays are in `experts` now
 
-    random.seed(args.seed)  # this file draws from neither; of environments that do, resumed runs end with other bytes
+    random.seed(args.seed)  # for environments that draw from these two; their resumed runs end with other bytes
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
@@ -2063,7 +2087,7 @@ def main(args: Args) -> int:
             print("--resume: the replayed episode differs (another machine?), goes on with it", file=sys.stderr)
         if checkpoint["arithmetic"] != device.type:
             print(
-                f"--resume: was on {checkpoint['arithmetic']}, goes on on {device.type}: bytes will differ",
+                f"--resume: was on {checkpoint['arithmetic']}, goes on as {device.type}: bytes will differ",
                 file=sys.stderr,
             )
     global_step = iteration * args.batch_size

@@ -18,7 +18,7 @@ only where a segment begins, w_t with each step. Actor and critic see both, and 
 | boundaries | Eq. 3.3.1 to 3.3.7 | rung (a) of `hwm_segment.py`, with a q(m) that starts with many reads, and a budget of them (rung (e), with a narrow w, taught no agent: `benchmark/results/dreamer/limits.md`); where the agents read in the end means little (`benchmark/results/README.md`) |
 | the model's other departures | | as in `hwm_segment.py`: v is copied with c, KL_z does not price reads, KL_m has weight 0.3, h_t sees z_t (Eq. 3.3.1); no read or copy is forced within an episode |
 | faithful model | | `--size thesis --kl-z-scale 1 --kl-w-scale 1 --kl-m-scale 1 --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0`, but for the KL terms' balance of 0.8 |
-| Eq. 3.3.8, 3.3.9 | sums over a dream | means, each step weighed by how likely the dream comes to it, and by its discount |
+| Eq. 3.3.8, 3.3.9 | sums over a dream | means, each step weighted by how likely the dream is to come to it, and by its discount |
 | acting | not said | m from p(m), z from q where it is read, w from q |
 """
 
@@ -45,6 +45,7 @@ import functools
 import hashlib
 import importlib.util
 import io
+import itertools
 import json
 import math
 import os
@@ -133,8 +134,8 @@ class Args:
     chunk_length: int | None = None
     """steps of a chunk; episodes follow each other in it (DreamerV2)"""
     rewarded_share: float | None = None
-    """share of the chunks that hold a reward, where there is one, and above 0 one chunk at least; all others are drawn from
-    anywhere (ours)"""
+    """share of a batch's chunks that are drawn so that they hold a reward, above 0 at least one chunk, as soon as the replay holds a
+    reward; the others are drawn from anywhere (ours)"""
     starts: int | None = None
     """states of a batch at which dreams start, at most (DreamerV2: all)"""
     horizon: int = 15
@@ -180,8 +181,8 @@ class Args:
     kl_m_scale: float = 0.3
     """weight of KL[q(m) ‖ p(m)] (Eq. 3.3.5: 1)"""
     entropy_scale: float | None = None
-    """weight of the entropy of categorical codes at first, to none over `--kl-warmup`; without it the goal, which is learned first, takes
-    all codes, sharp ones that learn little more, and some seeds do not see the agent for hundreds of updates (ours)"""
+    """weight of a bonus for the entropy of categorical codes, annealed to 0 over `--kl-warmup`; without it the codes become sharp on the
+    goal, which is learned first, and some seeds do not see the agent for hundreds of updates (ours)"""
     kl_warmup: int | None = None
     """updates over which the weights of KL_z and KL_w grow from a tenth (ours)"""
     kl_balance: float = 0.8
@@ -205,7 +206,8 @@ class Args:
     decoder_sees_c: bool = True
     """the decoder sees c_t too (Eq. 3.3.1), not only v_t: c_t knows of frames a step late"""
     budget: float = 0.23
-    """share of steps read without a price, from 1 over `--budget-updates`, by q(m) and not counting those after a first read (ours)"""
+    """share of steps that q(m) may read without a price, annealed from 1 over `--budget-updates`; the step after an episode's first does
+    not count (ours)"""
     budget_price: float = 10.0
     """price of the reads beyond it, on the mean read rate; 0: no budget (ours)"""
     budget_updates: int = 5_000
@@ -415,7 +417,7 @@ class Maze:
 
 
 def area_weights(length: int, side: int) -> np.ndarray:
-    """The matrix (side, length) that shrinks a line of pixels by averaging, each weighed by the part that is covered."""
+    """The matrix (side, length) that shrinks a line of pixels by averaging, each weighted by the part of it that is covered."""
     edges = np.linspace(0, length, side + 1)
     pixels = np.arange(length)
     covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
@@ -585,7 +587,7 @@ ROOM_SIZES = {"FourRooms11-v0": 11, "FourRooms19-v0": 19}  # cells of the maze's
 # ---------------------------------------------------------------------------------------------------------------------
 # The replay: the whole history, as numbers
 # ---------------------------------------------------------------------------------------------------------------------
-RECORD = np.dtype(  # a step of a game: where it arrived, by which action, and what for
+RECORD = np.dtype(  # a step of a game: the state that it led to, its action and its reward
     [("pose", "<u2"), ("goal", "<u2"), ("action", "u1"), ("first", "u1"), ("terminal", "u1"), ("reward", "<f4")]
 )
 
@@ -817,7 +819,7 @@ class Categorical(NamedTuple):
     logits: torch.Tensor  # (..., variables, classes)
 
 
-class Head(nn.Module):
+class DistributionHead(nn.Module):
     """Features, and for a posterior the frame's embedding, -> the distribution of v or y.
 
     Categorical where there are classes, else N(μ, σ) with σ = 2 sigmoid(x / 2) + 0.1, x starting near `std_bias`.
@@ -965,12 +967,12 @@ class HWM(nn.Module):
         self.embed = nn.Linear(self.encoder.size, hidden)
         self.posterior_m = Posterior(hidden, 64, args.read_bias, args.boundary_bound)  # q(m | O)
         self.z_rnn = Recurrence(sz + dw + sw + num_actions, hidden, dz)  # f_z-rnn
-        self.prior_z = Head(dz, args.stoch_z, args)  # p(v_t | c_t)
-        self.posterior_z = Head(dz, args.stoch_z, args)  # q(v_t | c_t, o_t)
+        self.prior_z = DistributionHead(dz, args.stoch_z, args)  # p(v_t | c_t)
+        self.posterior_z = DistributionHead(dz, args.stoch_z, args)  # q(v_t | c_t, o_t)
         self.w_rnn = Recurrence(sw + num_actions + z, hidden, dw)  # f_w-rnn
-        self.w_start = nn.Linear(z, dw)  # the rung "w-reset"
-        self.prior_w = Head(dw, args.stoch_w, args)  # p(y_t | h_t)
-        self.posterior_w = Head(dw + z, args.stoch_w, args)  # q(y_t | h_t, z_t, o_t)
+        self.w_start = nn.Linear(z, dw)  # for `--w-reset`
+        self.prior_w = DistributionHead(dw, args.stoch_w, args)  # p(y_t | h_t)
+        self.posterior_w = DistributionHead(dw + z, args.stoch_w, args)  # q(y_t | h_t, z_t, o_t)
         self.prior_m = mlp(w + z + num_actions, hidden, 1, 2)  # p(m_t | w_t, z_t, a_t)
         self.decoder = (  # p(o_t | w_t, z_t)
             TileDecoder(self.feature_size, side, args.depth) if tiles else ConvDecoder(self.feature_size, args.depth)
@@ -996,6 +998,7 @@ class HWM(nn.Module):
         return torch.cat([uniforms(*shape, 1, device=self.frame_mean.device), numbers], -1)
 
     def draws(self, noise: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Noise (..., 1 + stoch_z + stoch_w) -> its parts for m, v and y."""
         return noise.split([1, self.args.stoch_z, self.args.stoch_w], -1)
 
     def low_level(self, state: Belief, z: torch.Tensor, previous_action, read) -> torch.Tensor:
@@ -1022,7 +1025,7 @@ class HWM(nn.Module):
         q_w = self.posterior_w(torch.cat([h, z], -1), embed)
         return Belief(c, v, h, draw(q_w, draw_y), (1 - read.detach()) * (state.age + 1)), q_z, q_w
 
-    def reads(self, state: Belief, action: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
+    def draw_prior_m(self, state: Belief, action: torch.Tensor, uniform: torch.Tensor) -> torch.Tensor:
         """m_t (B, 1), drawn from p(m_t | w_t, z_t, a_t), or every `--fixed-interval` steps."""
         if self.args.fixed_interval:
             return (state.age + 1 >= self.args.fixed_interval).float()
@@ -1031,14 +1034,14 @@ class HWM(nn.Module):
 
     def filter(self, state: Belief, action: torch.Tensor, begins: torch.Tensor, embed, noise: torch.Tensor) -> tuple:
         """One step with a frame, m from p(m); begins (B, 1): 1 where an episode begins, whose past is forgotten."""
-        read = torch.maximum(begins, self.reads(state, action, noise[..., :1]))
+        read = torch.maximum(begins, self.draw_prior_m(state, action, noise[..., :1]))
         forgotten = Belief(*((1 - begins) * part for part in state))
         return self.step(forgotten, (1 - begins) * action, read, embed, noise)
 
     def imagine_step(self, state: Belief, action: torch.Tensor, noise: torch.Tensor) -> Belief:
         """One step without a frame: m, v and y from their priors (Eq. 3.3.1)."""
         uniform, draw_v, draw_y = self.draws(noise)
-        read = self.reads(state, action, uniform)
+        read = self.draw_prior_m(state, action, uniform)
         c = read * self.high_level(state, action) + (1 - read) * state.c
         v = read * draw(self.prior_z(c), draw_v) + (1 - read) * state.v
         z = torch.cat([c, v], -1)
@@ -1103,7 +1106,7 @@ def world_model_loss(model: HWM, data: Chunks, updates: int) -> tuple[torch.Tens
     flat = Belief(*(part.flatten(0, 1) for part in made.belief))
     image = 0.5 * F.mse_loss(model.decode(flat).float(), frames, reduction="sum") / len(frames)
     p_z, p_w = model.prior_z(made.belief.c), model.prior_w(made.belief.h)
-    weight = made.reads.detach() if args.detach_kl_z else made.reads  # Eq. 3.3.7 weighs KL_z by q(M)
+    weight = made.reads.detach() if args.detach_kl_z else made.reads  # Eq. 3.3.7 weights KL_z by q(M)
     kl_z = weight * balanced(kl_divergence, made.q_z, p_z, args.kl_balance)
     kl_w = balanced(kl_divergence, made.q_w, p_w, args.kl_balance)
     decides = 1 - made.forced[1:]  # q(m_t) pairs with p(m_t) where step t + 1 was free to read or to copy
@@ -1309,6 +1312,10 @@ class Learner:
         alive = torch.nonzero(terminals.flatten() == 0).squeeze(1)
         chosen = alive[torch.randperm(len(alive))[: self.args.starts].to(alive.device)]
         return type(states)(*(part.detach().flatten(0, 1)[chosen] for part in states))
+
+    def is_finite(self) -> bool:
+        parameters = itertools.chain(self.model.parameters(), self.behaviour.parameters())
+        return all(bool(parameter.isfinite().all()) for parameter in parameters)
 
     def state_dict(self) -> dict:
         optimizers = {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()}
@@ -1524,7 +1531,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -1585,7 +1592,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -1604,6 +1611,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -1616,11 +1625,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -1756,7 +1765,7 @@ def fewest_steps(maze: Maze) -> np.ndarray:
 def evaluate(learner: Learner, args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes with seeds that training does not use, greedily; write `evaluation.json`, `dream.png` and videos.
 
-    `optimal` is the mean return of shortest ways from the same starts, `solved` the share of the goals that were reached.
+    `optimal` is the mean return of shortest paths from the same starts, `solved` the share of the goals that were reached.
     """
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
     with own_randomness(args.seed):
@@ -1857,7 +1866,7 @@ def plot_learning_curve(run_dir: Path, args: Args, evaluation: dict) -> None:
         axes.plot(steps[window - 1 :], means, color="tab:blue", label=f"mean of {window} episodes (sampled)")
     label = f"evaluation (greedy, {args.eval_episodes} episodes): {evaluation['mean']:.3f}"
     axes.axhline(evaluation["mean"], color="tab:orange", linestyle="--", label=label)
-    label = f"shortest ways from the same starts: {evaluation['optimal']:.3f}"
+    label = f"shortest paths from the same starts: {evaluation['optimal']:.3f}"
     axes.axhline(evaluation["optimal"], color="black", linestyle=":", label=label)
     axes.set_title(f"{args.env_id}, HWM Dreamer, size {args.size}, seed {args.seed}")
     axes.set_xlabel("environment steps")
@@ -1993,8 +2002,8 @@ def main(args: Args) -> int:
             compared = compare_dream(learner, args) if is_due else unknown
             metrics |= compared
             updates_csv.write({"global_step": global_step, "charts/episodic_return": mean_return, **metrics})
-            if not all(math.isfinite(value) for name, value in metrics.items() if name.startswith("losses/")):
-                raise RunError(f"step {global_step}: a loss is no longer finite ({metrics})")
+            if not learner.is_finite():
+                raise RunError(f"step {global_step}: the parameters are no longer finite (last metrics: {metrics})")
         seconds, last_time = time.perf_counter() - last_time, time.perf_counter()
         training_seconds += seconds
         add_scalars(writer, {**metrics, "charts/SPS": BLOCK / seconds}, global_step)

@@ -1,7 +1,7 @@
 """The hierarchical world model (HWM) alone: reconstruction and segmentation of episodes (thesis section 3.3, Fig. 3.4).
 
     python cleanrl_thesis/ppo_fourrooms.py --stop-at 1100000 --save-demos 2300 --run-dir runs/rooms      # the episodes
-    python cleanrl_thesis/hwm_segment.py --demos runs/rooms/demos                                        # rung (e) of the ladder
+    python cleanrl_thesis/hwm_segment.py --demos runs/rooms/demos                                        # the default, rung (e)
 
 It is trained to maximise J_HWM (Eq. 3.3.5) on 25,000 observation-action pairs; the other episodes of the folder are held out,
 and measured as in section 3.5.1: z_0 from q(z), later z from p(z), w from q(w), the boundary m from p(m). `segmentation.json`
@@ -21,8 +21,9 @@ be sent again after every crash: on the same machine the run ends with the same 
 | forced reads and copies | no | in training a read after 20 steps without (`--max-segment-length`), and with `--max-segments` copies after so many (VTA); KL_m leaves these steps out, VTA trains q there |
 | KL_z prices reads | yes | no (`--detach-kl-z`, VTA) |
 
-The default is rung (e) of the ladder against collapse. Rung (a), Eq. 3.3.1 to 3.3.7 but for forced reads and copies and the
-weights of KL_z and KL_w:
+Left alone, m collapses: z is never read again, or at every step. The settings tried against that are the rungs (a) to (g) of a
+ladder (`benchmark/hwm_segment.sh`); the default is rung (e). Rung (a) is Eq. 3.3.1 to 3.3.7 but for forced reads and copies, the
+weights of KL_z, KL_w and the reconstruction, the red channel's factor and the balance of the KL terms:
 `--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0
 --read-bias 0 --stoch-w 16 --kl-m-scale 1 --max-segments 10`; rung (g), which draws reads to where z is foretold:
 `--kl-z-scale 1 --no-c-sees-w --surprise-price 4 --foretell-copies 0.1 --total-updates 5000 --budget-updates 3200`, with
@@ -116,8 +117,8 @@ class Args:
     heldout_episodes: int = 400
     """episodes held out, at most (ours)"""
     heldout_demos: Path | None = None
-    """folder whose episodes are held out, where those to train on are of another player: those after its first `--train-pairs`
-    pairs, from which the probes learn; default: the rest of `--demos` (ours)"""
+    """demonstrations of a second player to measure on: the probes learn from the first 400 of the episodes with its first
+    `--train-pairs` pairs, the episodes after these are held out; default: `--demos` serves for both (ours)"""
     frame_side: int = 22
     """pixels of the frames' side, to which the recorded ones are shrunk; two for each cell of the 11 × 11 maze (ours)"""
     red_scale: float = 5.0
@@ -160,7 +161,7 @@ class Args:
     kl_balance: float = 0.8
     """share of each KL term's gradient that trains p, the rest trains q (DreamerV2)"""
     detach_kl_z: bool = True
-    """KL_z weighs the reads, and does not price them (VTA); off: Eq. 3.3.7"""
+    """KL_z counts at the reads, and does not price them (VTA); off: it does (Eq. 3.3.7)"""
     temperature: float = 0.3
     """last temperature of the binary Gumbel samples of m; from 1 over `--budget-updates` (ours)"""
     boundary_bound: float = 4.0
@@ -194,8 +195,8 @@ class Args:
     budget_updates: int | None = None
     """updates of an attempt over which budget and temperature come to their last values; default: 80% of them (ours)"""
     surprise_price: float = 0.0
-    """price of a nat by which KL_z of a read is above their mean, from 0 over `--surprise-updates` after the budget, which is then
-    one from both sides: z is rather read where it is foretold; 0 for none (ours)"""
+    """price, per nat, of reads whose KL_z exceeds the mean over reads; those below it earn as much. It rises from 0 over
+    `--surprise-updates` once the budget is annealed; with it read rates below the budget cost too; 0 for none (ours)"""
     surprise_updates: int = 500
     """updates over which that price grows (ours)"""
     foretell_copies: float = 0.0
@@ -285,7 +286,7 @@ class Episode(NamedTuple):
 
 
 def area_weights(length: int, side: int) -> np.ndarray:
-    """The matrix (side, length) that shrinks a line of pixels by averaging, each weighed by the part that is covered."""
+    """The matrix (side, length) that shrinks a line of pixels by averaging, each weighted by the part of it that is covered."""
     edges = np.linspace(0, length, side + 1)
     pixels = np.arange(length)
     covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
@@ -341,6 +342,9 @@ def split_episodes(episodes: list[Episode], args: Args, flag: str = "--demos") -
     return episodes[:first], episodes[first : first + args.heldout_episodes]
 
 
+PROBED_EPISODES = 400  # that the probes learn from, at most
+
+
 class Split(NamedTuple):
     """Which episodes serve for what."""
 
@@ -358,7 +362,7 @@ def read_split(args: Args) -> tuple[Split, str]:
         others, other_id = read_demonstrations(args.heldout_demos, args.frame_side, "--heldout-demos")
         require(other_id == env_id, "--heldout-demos", args.heldout_demos, f"must be of {env_id}, is of {other_id}")
         probed, heldout = split_episodes(others, args, "--heldout-demos")
-    return Split(training, probed[:400], heldout), env_id
+    return Split(training, probed[:PROBED_EPISODES], heldout), env_id
 
 
 class Normalizer(NamedTuple):
@@ -546,7 +550,7 @@ class HWM(nn.Module):
         self.prior_z = NormalHead(dz, hidden, sz, args.std_bias)  # p(v_t | c_t)
         self.posterior_z = NormalHead(dz + embed, hidden, sz, args.std_bias)  # q(v_t | c_t, o_t)
         self.w_rnn = GRUCell(sw + num_actions + z, dw)  # f_w-rnn
-        self.w_start = nn.Linear(z, dw)  # the rung "w-reset"
+        self.w_start = nn.Linear(z, dw)  # for `--w-reset`
         self.prior_w = NormalHead(dw, hidden, sw, args.std_bias)  # p(y_t | h_t)
         self.posterior_w = NormalHead(w - sw + z + embed, hidden, sw, args.std_bias)  # q(y_t | h_t, z_t, o_t)
         self.prior_m = mlp(w + z + num_actions, hidden, 1, 2)  # p(m_t | w_t, z_t, a_t)
@@ -616,9 +620,8 @@ class HWM(nn.Module):
         previous_m, previous_action = frames.new_zeros(batch, 1), torch.zeros_like(taken[0])
         made = []
         for t in range(steps):
-            begins = (
-                first[t, :, None] if t else torch.ones_like(length)
-            )  # READ is forced where a chunk or an episode begins
+            # READ is forced where a chunk or an episode begins
+            begins = first[t, :, None] if t else torch.ones_like(length)
             read, force = begins + (1 - begins) * previous_m, begins
             if trains and self.args.max_segment_length:
                 too_long = (length >= self.args.max_segment_length).float()
@@ -657,18 +660,18 @@ def hwm_loss(
 ) -> tuple[torch.Tensor, dict]:
     """−J_HWM (Eq. 3.3.5) per step, and its terms.
 
-    budget: the share of steps that may be read without a price; surprise_price: that of a nat by which KL_z of a read that q(m)
-    chose is above their mean, and what a nat below pays.
+    budget: the share of steps that may be read without a price; surprise_price: the price, per nat, of reads chosen by q(m) whose
+    KL_z exceeds their mean; those below it earn as much.
     """
     args, made = model.args, model.infer(data, "train", temperature)
     reconstruction = 0.5 * args.image_scale * (model.decode(made.belief) - data.frames).square().sum(-1)  # (T, B)
     p_z, p_w = model.prior_z(made.updated), model.low_level(model.prior_w, made.belief.h)
-    weight = made.reads.detach() if args.detach_kl_z else made.reads  # Eq. 3.3.7 weighs KL_z by q(M)
+    weight = made.reads.detach() if args.detach_kl_z else made.reads  # Eq. 3.3.7 weights KL_z by q(M)
     surprise = balanced(kl_normal, made.q_z, p_z, args.kl_balance)  # of a read, whether or not there is one
     kl_z = weight * surprise
     kl_w = balanced(kl_normal, made.q_w, p_w, args.kl_balance)
     chosen = 1 - made.forced
-    decides = torch.cat([chosen[1:], torch.zeros_like(chosen[:1])])  # m_t of the last step, and before a forced read
+    decides = torch.cat([chosen[1:], torch.zeros_like(chosen[:1])])  # m_t is not used before a forced read
     kl_m = decides * balanced(kl_bernoulli, made.q_m, made.p_m, args.kl_balance)
     reads = made.reads * chosen
     read_rate = reads.sum() / chosen.sum().clamp(min=1)
@@ -715,7 +718,7 @@ def train_step(model: HWM, optimizer: torch.optim.Adam, data: Sequence, update: 
 
 @torch.no_grad()
 def objective(model: HWM, data: Sequence) -> float:
-    """J_HWM per step of the training data, with m, z and w drawn from q: KL terms with weight 1 (Eq. 3.3.5), frames as learned."""
+    """J_HWM per step of the training data, with m, z and w drawn from q: KL terms weigh 1 (Eq. 3.3.5), frames as in training."""
     args, state = model.args, torch.get_rng_state()
     torch.manual_seed(args.seed)
     starts = torch.arange(0, len(data.actions) - args.chunk_length + 1, args.chunk_length)
@@ -790,7 +793,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -839,7 +842,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -858,6 +861,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -870,11 +875,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -1344,8 +1349,8 @@ def main(args: Args) -> int:
         if update % LOG_INTERVAL == 0 or update % args.total_updates == 0:
             updates_csv.write({"global_step": update, **metrics})
             add_scalars(writer, {**metrics, "charts/updates_per_second": update / training_seconds}, update)
-        if not math.isfinite(metrics["losses/loss"]):
-            raise RunError(f"update {update}: the loss is no longer finite ({metrics})")
+        if not all(parameter.isfinite().all() for parameter in model.parameters()):
+            raise RunError(f"update {update}: the model's parameters are no longer finite (last metrics: {metrics})")
         if crossed or stop.received or update == last_update:
             state = {
                 "args": arguments(args),

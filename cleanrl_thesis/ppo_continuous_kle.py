@@ -301,7 +301,7 @@ class ZeroContactHumanoidEnv(HumanoidEnv):
 
 
 class QuickMixin:
-    """Gymnasium's -v4 tasks number for number, with less time spent around the simulator."""
+    """Gymnasium's -v4 tasks with their default arguments, number for number, with less time spent around the simulator."""
 
     def do_simulation(self, ctrl: np.ndarray, n_frames: int) -> None:
         self.data.ctrl[:] = ctrl
@@ -575,12 +575,15 @@ mujoco.set_mju_user_warning(report_mujoco_warning)
 
 def make_env(env_id: str, render_mode: str | None = None) -> gym.Env:
     """Make an environment with `Box` observations and actions. Raises UsageError."""
+    drawn = {} if render_mode is None else {"render_mode": render_mode}  # not every environment knows the word
     try:
-        env = gym.make(env_id, render_mode=render_mode, disable_env_checker=True)
-    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
+        env = gym.make(env_id, disable_env_checker=True, **drawn)
+    except (gym.error.Error, AttributeError, ImportError, OSError, TypeError, ValueError) as error:
         raise UsageError(f"--env-id {env_id}: {first_line(error)}") from None
     for name, space in (("observations", env.observation_space), ("actions", env.action_space)):
         require(isinstance(space, gym.spaces.Box), "--env-id", env_id, f"needs Box {name}, this one has {space}")
+    is_continuous = np.issubdtype(env.action_space.dtype, np.floating)
+    require(is_continuous, "--env-id", env_id, f"needs actions that are floats, this one has {env.action_space}")
     model = getattr(env.unwrapped, "model", None)
     if isinstance(model, mujoco.MjModel) and model.ntree == 1:  # it is one island: looking for more takes up to 7%
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
@@ -646,8 +649,12 @@ class Agent(nn.Module):
 def numpy_policy(agent: Agent):
     """The policy's mean as a numpy function, (N, O) -> (N, A): without torch's overhead of 100 µs for one observation.
 
-    On the CPU it shares the agent's memory; on a GPU it is a copy, to be made anew after each update.
+    On the CPU it shares the agent's memory; on a GPU it is a copy, to be made anew after each update. It is the twin of
+    `Agent.actor_mean`: change both.
     """
+    unknown = {type(module) for module in agent.actor_mean} - {nn.Linear, Tanh, nn.ReLU}
+    if unknown:
+        raise TypeError(f"numpy_policy would leave out what is new in actor_mean: {unknown}")
     linears = [module for module in agent.actor_mean if isinstance(module, nn.Linear)]
     layers = [[tensor.detach().cpu().numpy() for tensor in (linear.weight.T, linear.bias)] for linear in linears]
     activation = np.tanh if isinstance(agent.actor_mean[1], Tanh) else functools.partial(np.maximum, 0.0)
@@ -716,7 +723,7 @@ class Episode:
 
     Each reset has a seed of its own, so the episode's number and actions determine the environment's state: a
     checkpoint keeps those two, and `replay` plays them again. Holds for every environment whose randomness comes from
-    `reset(seed=)`.
+    `reset(seed=)`; where episodes have no end, checkpoints grow with the run.
     """
 
     def __init__(self, env: gym.Env, seed: int, stream: int, gamma: float):
@@ -734,7 +741,7 @@ class Episode:
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool]:
         """Apply an action (A,) within the bounds; return observation (O,), reward, terminated, truncated."""
-        self.actions.append(action)
+        self.actions.append(action.copy())  # some environments change theirs
         obs, reward, terminated, truncated, _ = self.env.step(action.reshape(self.action_shape))
         reward = float(reward)
         self.episodic_return += reward
@@ -1011,6 +1018,10 @@ class FlatAdam:
 
     def __init__(self, agent: Agent, learning_rate: float, value_learning_rate: float):
         self.parameters = [*agent.policy_parameters(), *agent.critic.parameters()]
+        if len(self.parameters) < len(list(agent.parameters())):
+            raise ValueError(
+                "a part of the agent is neither in policy_parameters() nor in critic, and would not be trained"
+            )
         self.shapes = [parameter.shape for parameter in self.parameters]
         self.vector = torch.cat([parameter.detach().reshape(-1) for parameter in self.parameters])
         self.gradient, self.mean, self.square = (torch.zeros_like(self.vector) for _ in range(3))
@@ -1039,7 +1050,7 @@ class FlatAdam:
 def adam_step(vector, mean, square, step, rates, gradient, max_grad_norm: float, eps: float) -> None:
     """Clip the gradient's norm and take one step of Adam; changes the first four in place.
 
-    All tensors are of shape (P,) but `step`, which counts and is a scalar, and `rates`, which may be one too.
+    All tensors are (P,), but `step`, a scalar that counts the steps, and `rates`, (P,) or a scalar.
     """
     gradient = gradient * (max_grad_norm / (gradient.norm() + 1e-6)).clamp(max=1.0)
     step.add_(1)
@@ -1221,7 +1232,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -1270,7 +1281,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -1289,6 +1300,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -1301,11 +1314,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -1377,7 +1390,7 @@ def play(agent: Agent, env: gym.Env, args: Args, seed: int) -> dict[str, np.ndar
     low, high = np.ravel(env.action_space.low), np.ravel(env.action_space.high)
     rng = np.random.default_rng([seed, 1])  # [seed] alone would be the environment's own stream
     obs, _ = env.reset(seed=seed)
-    observations, actions, rewards = [obs], [], []
+    observations, actions, rewards = [np.array(obs)], [], []
     terminated = truncated = False
     while not (terminated or truncated):
         x = np.ravel(obs)
@@ -1387,9 +1400,9 @@ def play(agent: Agent, env: gym.Env, args: Args, seed: int) -> dict[str, np.ndar
         if args.eval_mode == "sampled":
             action = action + std * rng.standard_normal(len(std), np.float32)
         action = bounded(action, low, high).reshape(env.action_space.shape)
+        actions.append(action.copy())
         obs, reward, terminated, truncated, _ = env.step(action)
-        observations.append(obs)
-        actions.append(action)
+        observations.append(np.array(obs))  # some environments give the same array in every step
         rewards.append(reward)
         truncated = truncated or len(rewards) == MAX_EVALUATION_STEPS
     return {
@@ -1538,7 +1551,7 @@ def main(args: Args) -> int:
     if args.track:
         start_wandb(args, run_dir)
 
-    random.seed(args.seed)  # this file draws from neither; of environments that do, resumed runs end with other bytes
+    random.seed(args.seed)  # for environments that draw from these two; their resumed runs end with other bytes
     np.random.seed(args.seed)
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic

@@ -238,7 +238,6 @@ DOORS = {  # x, y of the upper, left, right and lower door
     11: ((5, 2), (2, 5), (7, 5), (5, 8)),
     19: ((9, 7), (6, 9), (14, 9), (9, 12)),  # those that MiniGrid draws with seed 0
 }
-LEFT, RIGHT, FORWARD = range(3)
 HEADINGS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])  # x, y of a step forward: MiniGrid's directions 0 to 3
 TILE_SIDE = 32  # pixels of a cell in MiniGrid's picture
 
@@ -285,7 +284,7 @@ class Maze:
 
 
 def area_weights(length: int, side: int) -> np.ndarray:
-    """The matrix (side, length) that shrinks a line of pixels by averaging, each weighed by the part that is covered."""
+    """The matrix (side, length) that shrinks a line of pixels by averaging, each weighted by the part of it that is covered."""
     edges = np.linspace(0, length, side + 1)
     pixels = np.arange(length)
     covered = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
@@ -548,7 +547,7 @@ class Agent(nn.Module):
 
 
 def mean_frame(args: Args) -> torch.Tensor:
-    """The mean of the frames with which episodes can begin, (side, side, 3): what of a frame says nothing."""
+    """The mean of the frames with which episodes can begin, (side, side, 3), which is subtracted from each."""
     task = maze(ROOM_SIZES[args.env_id])
     starts = task.starts[:: max(1, len(task.starts) // 20_000)]
     frames = painter(task.size, args.frame_side).draw(starts[:, 0], starts[:, 1])
@@ -806,7 +805,7 @@ def arguments(args: Args) -> dict:
 def save_checkpoint(run_dir: Path, state: dict) -> None:
     """Write `checkpoint.pt`; the one before it stays as `checkpoint.previous.pt`."""
     content = io.BytesIO()
-    torch.save({"format": CHECKPOINT_FORMAT, **state}, content)
+    torch.save({"format": CHECKPOINT_FORMAT, "script_sha256": SCRIPT_SHA256, **state}, content)
     write_whole(run_dir / "checkpoint.pt", content.getvalue(), keep_old_as="checkpoint.previous.pt")
 
 
@@ -855,7 +854,7 @@ def check_same_run(args: Args, saved: dict, run_dir: Path) -> None:
 def open_run_dir(args: Args) -> tuple[Path, dict | None]:
     """Create the run's folder, or with `--resume` go on in it; return it and its checkpoint.
 
-    The folder stays locked while the process lives. Raises UsageError, and then nothing whole in it has changed.
+    The folder stays locked while the process lives. Where it raises UsageError, no whole file in it has changed.
     """
     name = f"{args.env_id.replace('/', '_')}__{args.exp_name}__{args.seed}__{int(time.time())}"
     run_dir, checkpoint = args.run_dir or Path("runs") / name, None
@@ -874,6 +873,8 @@ def open_run_dir(args: Args) -> tuple[Path, dict | None]:
         raise UsageError(f"--run-dir {run_dir}: cannot be used: {error.strerror}") from None
     if checkpoint is not None:
         check_same_run(args, checkpoint["args"], run_dir)
+        if checkpoint.get("script_sha256", SCRIPT_SHA256) != SCRIPT_SHA256:
+            print("--resume: this script has changed since the last checkpoint: bytes may differ", file=sys.stderr)
     return run_dir, checkpoint
 
 
@@ -886,11 +887,11 @@ def is_done(run_dir: Path, args: Args, last_step: int) -> bool:
 
 
 def forget_end(run_dir: Path, goes_on: bool) -> None:
-    """Take away what says that the run is done, and where training goes on what was saved of an agent that it leaves behind."""
+    """Remove `result.json`, and where training `goes_on` what was saved of the agent as it was then."""
     saved = ("model.safetensors", "demos*/manifest.json", "videos/*.mp4") if goes_on else ()
     for pattern in ("result.json", *saved):
         for path in run_dir.glob(pattern):
-            if path.parent.name != "demos_synthetic_human":
+            if path.parent.name != "demos_synthetic_human":  # which a student learns from
                 path.unlink()
 
 
@@ -1004,7 +1005,7 @@ def fewest_steps(maze: Maze) -> np.ndarray:
 def evaluate(agent: Agent, args: Args, run_dir: Path) -> dict:
     """Play `--eval-episodes` episodes that training never saw, greedily; write `evaluation.json` and, if asked, a video.
 
-    `optimal` is the mean return of shortest ways from the same starts, `solved` the share of the goals that were reached.
+    `optimal` is the mean return of shortest paths from the same starts, `solved` the share of the goals that were reached.
     """
     seeds = [episode_seed(args.seed, EVALUATION_STREAM, i) for i in range(args.eval_episodes)]
     episodes = play(agent, args, seeds, "greedy")
@@ -1105,7 +1106,7 @@ def plot_learning_curve(run_dir: Path, args: Args, evaluation: dict) -> None:
         axes.plot(steps[window - 1 :], means, color="tab:blue", label=f"mean of {window} episodes (sampled)")
     label = f"evaluation (greedy, {args.eval_episodes} episodes): {evaluation['mean']:.3f}"
     axes.axhline(evaluation["mean"], color="tab:orange", linestyle="--", label=label)
-    label = f"shortest ways from the same starts: {evaluation['optimal']:.3f}"
+    label = f"shortest paths from the same starts: {evaluation['optimal']:.3f}"
     axes.axhline(evaluation["optimal"], color="black", linestyle=":", label=label)
     axes.set_title(f"{args.env_id}, PPO, seed {args.seed}")
     axes.set_xlabel("environment steps")
@@ -1159,12 +1160,12 @@ def main(args: Args) -> int:
         check_video(args.env_id)
     run_dir, checkpoint = open_run_dir(args)
     last_iteration = min(args.num_iterations, math.ceil(args.stop_at / args.batch_size))
-    if is_done(run_dir, args, last_iteration * args.batch_size):
-        print(f"{run_dir} is done")
-        return 0
     reached = 0 if checkpoint is None else checkpoint["iteration"]
     is_behind = reached <= last_iteration  # or the demonstrations would be another player's
     require(is_behind, "--stop-at", args.stop_at, f"{run_dir} is at step {reached * args.batch_size} already")
+    if is_done(run_dir, args, last_iteration * args.batch_size):
+        print(f"{run_dir} is done")
+        return 0
     lost = checkpoint is None and (run_dir / "result.json").exists()
     require(not lost, "--resume", run_dir, "was finished with other flags, and its checkpoint is gone")
     write_json(run_dir / "args.json", arguments(args))
@@ -1220,9 +1221,9 @@ def main(args: Args) -> int:
             row = {"global_step": global_step + step, "episodic_return": episodic_return, "episodic_length": length}
             episodes_csv.write(row)
         global_step += args.batch_size
-        _, returns, lengths = np.mean(rollout.episodes, 0).tolist() if rollout.episodes else (math.nan,) * 3
-        metrics |= {"charts/episodic_return": returns, "charts/episodic_length": lengths}
-        progress.set_postfix_str(f"return {returns:.3f}", refresh=False)
+        _, mean_return, mean_length = np.mean(rollout.episodes, 0).tolist() if rollout.episodes else (math.nan,) * 3
+        metrics |= {"charts/episodic_return": mean_return, "charts/episodic_length": mean_length}
+        progress.set_postfix_str(f"return {mean_return:.3f}", refresh=False)
         progress.update(args.batch_size)
         now = time.perf_counter()
         training_seconds, last_time = training_seconds + now - last_time, now

@@ -58,7 +58,7 @@ import tempfile
 import time
 import warnings
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -86,7 +86,7 @@ class Args:
     export_minari: str | None = None
     """write the recordings as the Minari dataset of this id, instead of recording (`pip install "minari[hdf5]"`)"""
     seed: int | None = None
-    """seed of the episodes' seeds, with the number of those in the folder; default: fresh ones"""
+    """seed from which, with the number of recordings in the folder, the seeds of the episodes follow; default: random"""
     track_name: str = "meadow"
     """road of the driving task: meadow, speedway, hills or city"""
     brake: bool = True
@@ -148,7 +148,7 @@ def complete_args(args: Args) -> Args:
     require(args.seed is None or 0 <= args.seed < 2**32, "--seed", args.seed, "must be between 0 and 4294967295")
     modes = {"--practice": args.practice, "--verify": args.verify, "--export-minari": args.export_minari is not None}
     given = [flag for flag, holds in modes.items() if holds]
-    require(len(given) <= 1, " ".join(given), "", "must be given alone")
+    require(len(given) <= 1, " ".join(given), "", "exclude each other")
     if args.export_minari is not None:
         named = re.fullmatch(r"([\w-]+/)*[\w-]+-v\d+", args.export_minari) is not None
         require(named, "--export-minari", args.export_minari, "must be a Minari id as apple/anna-v0")
@@ -262,7 +262,7 @@ class Atari(Game):
             self.rules = (
                 "Keep the gopher from the three carrots. It digs holes up to the garden: stand over a hole and press the "
                 "button to fill it, a shovel at a time. When the gopher comes out, hit it with the button. Three carrots "
-                "stolen, and the round is over."
+                "stolen, and the round is over. Press the button to begin, and again after each carrot."
             )
 
     def action(self, keys: Keys) -> int:
@@ -294,8 +294,8 @@ class Driving(Game):
     """TorcsLike-v0: keys or a gamepad move a steering wheel and a pedal, which the car is given."""
 
     rules = (
-        "Drive as far as you can in 60 seconds. Stay on the road and away from the parked cars: the round ends where you leave "
-        "the road, touch a car or stand still."
+        "Drive as far as you can in 60 seconds. Hold the gas when the count ends: who stands still for a second is out. Stay on "
+        "the road and away from the parked cars: the round ends where you leave the road or touch a car."
     )
     keys = "Left and right arrow, or A and D, steer; up or W is the gas, down or S the brake. A gamepad works too."
     unit, action_dtype = "m", np.float32
@@ -346,6 +346,7 @@ def make_game(args: Args, recorded: dict | None = None) -> Game:
 # Recordings
 # ---------------------------------------------------------------------------------------------------------------------
 HUMAN_STREAM = 1_000_002
+PRACTICE_STREAM = 1_000_005  # or those who practise would know the rounds that are recorded
 
 
 def write_whole(path: Path, content: bytes, keep_old_as: str | None = None) -> None:
@@ -376,6 +377,8 @@ class Recordings:
     files: dict[str, str] = field(default_factory=dict)
     scores: list[float] = field(default_factory=list)
     torn: bool = False  # whether a crash came between an episode and the manifest
+    saved: dict = field(default_factory=dict)  # the manifest as it was
+    lost: int = 0  # recorded rounds that were broken off, or could not be kept
 
     @classmethod
     def open(cls, folder: Path, about: dict) -> "Recordings":
@@ -392,7 +395,7 @@ class Recordings:
             return recordings
         try:
             saved = json.loads(manifest.read_text())
-            files = dict(saved["files"])
+            files, recordings.lost = dict(saved["files"]), int(saved.get("rounds_not_kept", 0))
         except (OSError, ValueError, KeyError, TypeError):
             raise UsageError(f"--out {folder}: its manifest.json cannot be read") from None
         for name, flag in (("env_id", "--env-id"), ("player", "--player"), ("options", "--track-name or --brake")):
@@ -406,11 +409,25 @@ class Recordings:
             recordings.scores.append(float(read_arrays(path)["rewards"].sum()))
         missing = sorted(files.keys() - recordings.files.keys())
         require(not missing, "--out", folder, f"lacks {', '.join(missing)}, which its manifest names")
-        recordings.torn = recordings.files.keys() != files.keys()
+        recordings.torn, recordings.saved = recordings.files.keys() != files.keys(), saved
         return recordings
 
+    def check_emulator(self) -> None:
+        """Raise UsageError where episodes of another emulator are there: the manifest names one."""
+        was, now = self.saved.get("ale_py"), self.about.get("ale_py")
+        allowed = f"was recorded with ale-py {was}, here is {now}; choose another folder"
+        require(was in (None, now), "--out", self.folder, allowed)
+
     def write_manifest(self) -> None:
-        write_json(self.folder / "manifest.json", {"version": 1, **self.about, "files": self.files})
+        about = {"version": 1, **self.about, "rounds_not_kept": self.lost}
+        write_json(self.folder / "manifest.json", {**about, "files": self.files})
+
+    def note_lost(self) -> None:
+        """Count a round that is not kept, without which the scores of the kept ones would look like those of all."""
+        self.lost += 1
+        if self.files:
+            with contextlib.suppress(OSError):  # the next round's manifest has it
+                self.write_manifest()
 
     def add(self, episode: dict[str, np.ndarray]) -> None:
         """Write an episode, and then the manifest."""
@@ -463,7 +480,8 @@ def verify(args: Args) -> int:
         episode = read_arrays(args.out / name)
         again = replay(game, episode)
         failures += again is None
-        played = len(episode["actions"]) / game.fps
+        times = episode.get("t_ns", np.arange(len(episode["actions"])) * 1e9 / game.fps)
+        played = times[-1] / 1e9 + 1 / game.fps
         print(f"{name}  {score:8.1f} {game.unit}  {played:6.1f} s  {'differs' if again is None else 'the same again'}")
     return int(failures > 0)
 
@@ -508,8 +526,10 @@ def export_minari(args: Args) -> int:
 # Playing
 # ---------------------------------------------------------------------------------------------------------------------
 COUNTDOWN, BUSY_TIME = 3, 1.0  # s before a round, and until a page that was just loaded anew is free
-MAX_BEHIND = 1.0  # s of pictures that the browser has not drawn; beyond, nobody sees what is played
-SILENT = "The browser drew no picture for a second: this round is not kept."
+MAX_BEHIND = 0.5  # s of pictures that the browser has not drawn; beyond, nobody sees what is played
+MAX_SLOWNESS = 0.1  # of a round's time, by which it may last longer than the game: who has more time plays better
+SILENT = "The browser drew no picture for half a second: this round is not kept. Load the page again if this repeats."
+SLOW = "The computer or the connection was too slow: the game ran slower than it should, and this round is not kept."
 MAX_BODY = 16_384  # bytes that a browser may send at once
 NAMES = {"left", "right", "up", "down", "fire"}
 
@@ -519,6 +539,7 @@ class Player:
 
     def __init__(self, websocket):
         self.websocket, self.keys = websocket, Keys()
+        self.tapped: frozenset[str] = frozenset()  # what was held since the last frame
         self.sent, self.drawn = 0, 0  # pictures, and the newest of them that is on the screen
         self.orders: asyncio.Queue[str] = asyncio.Queue()  # practice, record
         self.stopped, self.gone = False, False
@@ -554,6 +575,13 @@ class Player:
         if len(axes) != 2 or not all(map(math.isfinite, axes)):
             raise ValueError("axes")
         self.keys = Keys(frozenset(message["held"]) & NAMES, (axes[0], axes[1]), int(message["seq"]) % 2**32)
+        self.tapped |= self.keys.held
+
+    def take_keys(self) -> Keys:
+        """The keys for a frame: those that are held, and those that were pressed and let go since the last one."""
+        keys = replace(self.keys, held=self.keys.held | self.tapped)
+        self.tapped = frozenset()
+        return keys
 
     async def show(self, picture: bytes) -> None:
         """Send a picture, with the number of the message whose keys it follows and its own."""
@@ -576,8 +604,8 @@ class Clock:
         await asyncio.sleep(max(self.next - time.perf_counter(), 0))
 
 
-async def play_episode(game: Game, player: Player, seed: int) -> dict[str, np.ndarray] | None:
-    """Play one episode in real time; None where it was broken off, or where the browser draws no more.
+async def play_episode(game: Game, player: Player, seed: int) -> dict[str, np.ndarray] | str | None:
+    """Play one episode in real time; None where it was broken off, and why where it cannot be kept.
 
     Returns what `Recordings.add` writes: actions (T, ...), rewards (T,), t_ns (T,), terminated, truncated, seed, and
     observations (T + 1, ...), or for Atari lives (T,) and emulator_state.
@@ -591,12 +619,15 @@ async def play_episode(game: Game, player: Player, seed: int) -> dict[str, np.nd
             if player.stopped:
                 return None
     await player.tell(kind="go")
+    player.tapped = frozenset()  # keys of before
     clock, begun = Clock(game.fps), time.perf_counter_ns()
     while True:
         await clock.tick()
-        if player.stopped or player.sent - player.drawn > MAX_BEHIND * game.fps:
+        if player.stopped:
             return None
-        action = game.action(player.keys)
+        if player.sent - player.drawn > MAX_BEHIND * game.fps:
+            return SILENT
+        action = game.action(player.take_keys())
         columns["t_ns"].append(time.perf_counter_ns() - begun)
         obs, reward, terminated, truncated, info = game.env.step(action)
         columns["actions"].append(action)
@@ -605,6 +636,9 @@ async def play_episode(game: Game, player: Player, seed: int) -> dict[str, np.nd
         await player.show(game.picture())
         if terminated or truncated:
             break
+    frames, seconds = len(columns["t_ns"]) - 1, columns["t_ns"][-1] / 1e9
+    if seconds > (1 + MAX_SLOWNESS) * frames / game.fps + 0.1:
+        return SLOW
     dtypes = {"actions": game.action_dtype, "rewards": np.float64, "t_ns": np.int64, "lives": np.int64}
     episode = {name: np.array(column, dtypes.get(name)) for name, column in columns.items()}
     if isinstance(game, Atari):
@@ -627,7 +661,8 @@ async def serve_player(websocket, game: Game, recordings: Recordings | None, see
                 return
             recorded = order == "record" and recordings is not None
             episode = await play_episode(game, player, int(seeds.spawn(1)[0].generate_state(1)[0]))
-            if episode is not None and recorded:
+            kept = isinstance(episode, dict)
+            if kept and recorded:
                 before = len(recordings.files)
                 try:
                     recordings.add(episode)
@@ -636,9 +671,11 @@ async def serve_player(websocket, game: Game, recordings: Recordings | None, see
                     if len(recordings.files) == before:  # else the round is kept, only the manifest lacks it
                         await player.tell(kind="over", score=None, recorded=False, trouble=first_line(error))
                         continue
-            silent = {"trouble": SILENT} if episode is None and not player.stopped else {}
-            score = None if episode is None else float(episode["rewards"].sum())
-            await player.tell(kind="over", score=score, recorded=recorded and episode is not None, **silent)
+            elif recorded:
+                recordings.note_lost()
+            trouble = {"trouble": episode} if isinstance(episode, str) else {}
+            score = float(episode["rewards"].sum()) if kept else None
+            await player.tell(kind="over", score=score, recorded=recorded and kept, **trouble)
     except WebSocketDisconnect:
         return
     except RuntimeError:  # it was lost while something was sent
@@ -664,8 +701,9 @@ def make_app(args: Args, game: Game, recordings: Recordings | None):
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     page, hosts, busy = Path(__file__).with_suffix(".html").read_text(), allowed_hosts(args.host), asyncio.Lock()
-    begun = 0 if recordings is None else len(recordings.files)  # a folder that is added to gets other rounds
-    seeds = np.random.SeedSequence(None if args.seed is None else [args.seed, HUMAN_STREAM, begun])
+    # a folder that is added to gets other rounds
+    stream = [PRACTICE_STREAM] if recordings is None else [HUMAN_STREAM, len(recordings.files)]
+    seeds = np.random.SeedSequence(None if args.seed is None else [args.seed, *stream])
     about = {"title": args.env_id, "rules": game.rules, "keys": game.keys, "unit": game.unit}
 
     def is_known(connection: HTTPConnection) -> bool:
@@ -759,6 +797,7 @@ def main(args: Args) -> int:
     if not args.practice:
         make_folder(args.out)
         recordings = Recordings.open(args.out, about_recordings(args, game))
+        recordings.check_emulator()
         if recordings.torn:
             recordings.write_manifest()
     serve(make_app(args, game, recordings), listener, args.host)
@@ -770,12 +809,15 @@ def main(args: Args) -> int:
 
 
 def cli(argv: list[str] | None = None) -> int:
-    """Run from the command line: a user's mistake is one line and exit code 2."""
+    """Run from the command line: a user's mistake is one line and exit code 2, a full disk one line and exit code 1."""
     try:
         return main(parse_args(argv))
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

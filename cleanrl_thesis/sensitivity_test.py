@@ -10,11 +10,11 @@ own script is asked for episodes, or one of videos. All are drawn by the same re
 | what | how | source |
 |---|---|---|
 | a participant | consents, reads the rules, then sees two clips of each agent, in an order of their own | sections 2.4.1 to 2.4.3 |
-| clips | 15 s, driving 30 s, from a random moment; episodes that end sooner have none | sections 2.4.1 to 2.4.3; ours |
+| clips | 15 s, driving 30 s, from random moments, the same for each agent; episodes that end sooner have none | sections 2.4.1 to 2.4.3; ours |
 | double-blind | a clip's address is drawn at random for each participant; whose it is, is joined at `--export` alone | ours |
 | what is stored | age and gender if given, verdicts, comments; no name, address or time | ours |
 | an answer | is on disk when the page goes on; sent twice, it counts once and the first one stays | ours |
-| interval | 95%, Wilson's for the effective number of answers, for each participant judges several clips | ours |
+| interval | 95%, Wilson's for the effective number of answers, for each participant judges several clips; of these clips | ours |
 """
 
 # /// script
@@ -141,7 +141,7 @@ def read_text(path: Path, flag: str) -> str:
 
 def complete_args(args: Args) -> Args:
     """Check all. Raises UsageError."""
-    require(not (args.prepare and args.export), "--prepare --export", "", "must be given alone")
+    require(not (args.prepare and args.export), "--prepare --export", "", "exclude each other")
     needs = "is needed: the folder of the clips, a folder in it for each agent"
     require(args.export is not None or args.videos is not None, "--videos", "", needs)
     for flag, value in (("--clips", args.clips), ("--clips-per-agent", args.clips_per_agent)):
@@ -182,6 +182,7 @@ RULES = {
     "TorcsLike-v0": "The player drives the red car as far as it can in 60 seconds, on the road and past the parked cars.",
 }
 ATARI_SCALE = 3  # pixels of a clip for each of the console's
+TRIES = 1_000  # to draw moments that every agent has clips of
 CLIP_TIME = 315_532_800  # of every file, 1980-01-01: a clip does not tell when it was made
 
 
@@ -349,20 +350,6 @@ def ask_script(run_dir: Path, clips: int) -> None:
     require(done.returncode == 0, "--prepare", run_dir, f"{script.name} could not play: {last}")
 
 
-def choose_windows(
-    lengths: dict[Path, int], frames: int, clips: int, rng: np.random.Generator
-) -> list[tuple[Path, int]]:
-    """Where clips of so many frames begin: at random moments of as many episodes as there are, without overlap in one."""
-    paths = [Path(path) for path in rng.permutation([str(path) for path in lengths])]
-    turns = [path for turn in range(clips) for path in paths if lengths[path] >= (turn + 1) * frames][:clips]
-    windows = []
-    for path in dict.fromkeys(turns):
-        count = turns.count(path)
-        starts = np.sort(rng.integers(0, lengths[path] - count * frames + 1, count)) + np.arange(count) * frames
-        windows += [(path, int(start)) for start in starts]
-    return windows
-
-
 def write_clip(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     """Encode pictures as H.264 in MP4, of fixed settings and without metadata."""
     import imageio_ffmpeg
@@ -416,20 +403,59 @@ def prepare(args: Args) -> int:
     return 0
 
 
+def common_windows(
+    plays: dict[str, dict[Path, int]], frames: int, clips: int, rng: np.random.Generator
+) -> dict[str, list[tuple[Path, int]]] | None:
+    """Where clips of so many frames begin, for each agent in other episodes, but for all at the same moments.
+
+    The moment would tell them apart, which pictures show: an agent that often crashes has no late ones. Moments are drawn evenly
+    until each agent has an episode for each of them, if possible always another one; None where it never has.
+    """
+    latest = min(max(lengths.values(), default=0) for lengths in plays.values()) - frames
+    for _ in range(TRIES if latest >= 0 else 0):
+        starts = np.sort(rng.integers(0, latest + 1, clips))[::-1].tolist()  # the fewest episodes have the late ones
+        cuts = {name: place_windows(lengths, frames, starts, rng) for name, lengths in plays.items()}
+        if all(windows is not None for windows in cuts.values()):
+            return cuts
+    return None
+
+
+def place_windows(
+    lengths: dict[Path, int], frames: int, starts: list[int], rng: np.random.Generator
+) -> list[tuple[Path, int]] | None:
+    """An episode for each start, drawn of those that are long enough; one that has a clip already only where no other is left."""
+    taken: dict[Path, list[int]] = {path: [] for path in lengths}
+    windows = []
+    for start in starts:
+        fit = [path for path, length in lengths.items() if length >= start + frames]
+        fit = [path for path in fit if all(abs(start - other) >= frames for other in taken[path])]
+        fit = [path for path in fit if not taken[path]] or fit
+        if not fit:
+            return None
+        path = fit[rng.integers(len(fit))]
+        taken[path].append(start)
+        windows.append((path, start))
+    return windows
+
+
 def choose_cuts(plays: dict[str, Play], sources: dict[str, Path], args: Args, seconds: float) -> dict[str, list]:
     """Where the clips of each agent begin, and that for practice, of an episode that no other clip is of. Raises UsageError."""
-    rng, cuts, shown = np.random.default_rng(args.seed), {}, set()
-    for name, play in plays.items():
-        is_practice = name == "practice"
-        free = {path: length for path, length in play.lengths.items() if not is_practice or path.resolve() not in shown}
-        count = 1 if is_practice else args.clips
-        cuts[name] = choose_windows(free, round(seconds * play.fps), count, rng)
-        shown |= {path.resolve() for path, _ in cuts[name]}
-        if is_practice:
-            allowed = f"has no episode of {seconds:g} s of which the agents' clips show nothing: --clips may be less"
-            require(len(cuts[name]) == 1, "--practice", args.practice, allowed)
-        allowed = f"has {len(cuts[name])} clips of {seconds:g} s, needs {count}: --clips or --seconds may be less"
-        require(len(cuts[name]) == count, "--prepare", f"{name}={sources[name]}", allowed)
+    rng, agents = np.random.default_rng(args.seed), {name: play for name, play in plays.items() if name != "practice"}
+    frames = round(seconds * next(iter(plays.values())).fps)
+    for name, play in agents.items():
+        count = sum(length // frames for length in play.lengths.values())
+        allowed = f"has {count} clips of {seconds:g} s, needs {args.clips}: --clips or --seconds may be less"
+        require(count >= args.clips, "--prepare", f"{name}={sources[name]}", allowed)
+    cuts = common_windows({name: play.lengths for name, play in agents.items()}, frames, args.clips, rng)
+    allowed = f"have no {args.clips} clips of {seconds:g} s each that begin at the same moments: --clips or --seconds may be less"
+    require(cuts is not None, "--prepare", " ".join(args.prepare), allowed)
+    if "practice" in plays:
+        shown = {path.resolve() for windows in cuts.values() for path, _ in windows}
+        free = {path: length for path, length in plays["practice"].lengths.items() if path.resolve() not in shown}
+        shown_first = common_windows({"practice": free}, frames, 1, rng)
+        allowed = f"has no episode of {seconds:g} s of which the agents' clips show nothing: --clips may be less"
+        require(shown_first is not None, "--practice", args.practice, allowed)
+        cuts |= shown_first
     return cuts
 
 
@@ -585,7 +611,8 @@ def open_database(path: Path, clips: list[Clip]) -> None:
         with transaction(path) as db:
             known = {sha256: agent for sha256, agent in db.execute("SELECT sha256, agent FROM clips")}
             there = {clip.sha256: clip.agent for clip in clips}
-            require(known.items() <= there.items(), "--videos", "", f"lacks clips, or has changed ones, of {path}")
+            missing = f"clips that {path} has are missing or have changed"
+            require(known.items() <= there.items(), "--videos", "", missing)
             require(len(there) == len(clips), "--videos", "", "has the same clip twice")
             rows = [(clip.agent, clip.path.name, clip.sha256) for clip in clips if clip.sha256 not in known]
             random.SystemRandom().shuffle(rows)  # so that a clip's number tells nothing
@@ -595,17 +622,20 @@ def open_database(path: Path, clips: list[Clip]) -> None:
 
 
 def join(path: Path, key: str, age: int | None, gender: str | None, per_agent: int) -> None:
-    """Note a participant, and draw clips in a random order: of each agent those that were seen least. Twice is once."""
+    """Note a participant, and draw clips in a random order: of each agent those with the fewest answers. Twice is once.
+
+    Where they have as many, those come first that are least often with participants who have not answered yet.
+    """
     with transaction(path) as db:
         if db.execute("SELECT 1 FROM participants WHERE key = ?", (key,)).fetchone():
             return
         cursor = db.execute("INSERT INTO participants (key, age, gender) VALUES (?, ?, ?)", (key, age, gender))
         seen = db.execute(
-            "SELECT agent, clips.clip, COUNT(position) FROM clips LEFT JOIN trials USING (clip) GROUP BY clips.clip"
+            "SELECT agent, clips.clip, COUNT(verdict), COUNT(position) FROM clips LEFT JOIN trials USING (clip) GROUP BY clips.clip"
         ).fetchall()
         rng, agents = random.SystemRandom(), {}
         rng.shuffle(seen)
-        for agent, clip, _ in sorted(seen, key=lambda row: row[2]):
+        for agent, clip, *_ in sorted(seen, key=lambda row: row[2:]):
             agents.setdefault(agent, []).append(clip)
         drawn = [clip for clips in agents.values() for clip in clips[:per_agent]]
         rng.shuffle(drawn)
@@ -664,9 +694,9 @@ QUANTILE = statistics.NormalDist().inv_cdf(0.975)
 def interval(human: np.ndarray, judged: np.ndarray) -> tuple[float, float]:
     """95% interval of the share `human.sum() / judged.sum()`, counts of each participant (P,).
 
-    Wilson's, for as many independent answers as tell as much: one person's are alike. By how much is measured at participants'
-    deviations from the share (the design effect), and is at least as if answers were independent, at most as if each
-    participant had given one. Where all answers are the same nothing can be measured: then the latter.
+    Wilson's with the number of answers divided by the design effect, for one person's answers are alike. The effect is
+    estimated from the participants' deviations from the share, and kept between 1 (independent answers) and that of one answer
+    a participant, which is taken where all answers are the same and nothing can be estimated.
     """
     answers, share = judged.sum(), human.sum() / judged.sum()
     most = (judged**2).sum() / answers
@@ -695,7 +725,10 @@ def write_csv(path: Path, rows: list[dict]) -> None:
 
 
 def count_verdicts(answers: list[tuple]) -> list[dict]:
-    """For each agent the column "Identified as Human", from answers (participant, agent, verdict, ...)."""
+    """For each agent the column "Identified as Human", from answers (participant, agent, verdict, position, clip, ...).
+
+    The interval is that of other people who see the same clips.
+    """
     rows = []
     for agent in sorted({answer[1] for answer in answers}):
         people = sorted({who for who, name, *_ in answers if name == agent})
@@ -706,12 +739,16 @@ def count_verdicts(answers: list[tuple]) -> list[dict]:
         low, high = interval(human, judged)
         row = {"agent": guarded(agent), "identified_as_human": int(human.sum()), "judged": int(judged.sum())}
         row |= {"share": round(float(human.sum() / judged.sum()), 4), "low": round(low, 4), "high": round(high, 4)}
-        rows.append({**row, "participants": len(people)})
+        rows.append({**row, "participants": len(people), "clips": len({a[4] for a in answers if a[1] == agent})})
     return rows
 
 
 def export(args: Args) -> int:
-    """Join answers and agents: print the table, write it and the comments. Returns the exit code."""
+    """Join answers and agents: print the table, write it, the comments and who took part. Returns the exit code.
+
+    Participants are numbered anew, at random, and ages and genders stand apart: whoever knows when somebody was there finds
+    nothing of theirs.
+    """
     require(args.db.is_file(), "--db", args.db, "is no file")
     query = (
         "SELECT participant, agent, verdict, position, file, why, age, gender FROM trials JOIN clips USING (clip) "
@@ -723,13 +760,20 @@ def export(args: Args) -> int:
     except sqlite3.Error as error:
         raise UsageError(f"--db {args.db}: is no database of a study: {first_line(error)}") from None
     require(bool(answers), "--db", args.db, "holds no answers yet")
-    rows = count_verdicts(answers)
-    names = ("participant", "agent", "verdict", "position", "clip", "comment", "age", "gender")
+    rows, rng, people = count_verdicts(answers), random.SystemRandom(), {answer[0]: answer[6:] for answer in answers}
+    numbers = dict(zip(people, rng.sample(range(1, len(people) + 1), len(people))))
+    names = ("participant", "agent", "verdict", "position", "clip", "comment")
+    answers = sorted(((numbers[who], *rest) for who, *rest in answers), key=lambda answer: (answer[0], answer[3]))
     comments = [{name: guarded(value) for name, value in zip(names, answer)} for answer in answers]
+    about = [
+        {"age": guarded(age), "gender": guarded(gender)}
+        for age, gender in rng.sample(list(people.values()), len(people))
+    ]
     try:
         args.export.mkdir(parents=True, exist_ok=True)
         write_csv(args.export / "identified_as_human.csv", rows)
         write_csv(args.export / "comments.csv", comments)
+        write_csv(args.export / "participants.csv", about)
     except OSError as error:
         raise UsageError(f"--export {args.export}: cannot be written: {error.strerror}") from None
     print(f"{'agent':<24}identified as human      share and 95% interval   participants")
@@ -836,7 +880,7 @@ def make_app(args: Args, clips: list[Clip]):
     def show_page() -> Response:
         nonce = secrets.token_urlsafe(16)
         policy = "default-src 'none'; base-uri 'none'; frame-ancestors 'none'; form-action 'none'; "
-        policy += "connect-src 'self'; media-src 'self'; "
+        policy += "connect-src 'self'; media-src 'self' blob:; "
         policy += f"script-src 'nonce-{nonce}'; style-src 'nonce-{nonce}'"
         content = page.replace("{{nonce}}", nonce).replace("{{about}}", json.dumps(about).replace("<", "\\u003c"))
         headers = {"Content-Security-Policy": policy, "Cache-Control": "no-store"}
@@ -878,7 +922,8 @@ def make_app(args: Args, clips: list[Clip]):
         try:
             content = paths[sha256].read_bytes()
         except OSError as error:
-            print(f"error: --videos {paths[sha256]}: {error.strerror}", file=sys.stderr, flush=True)
+            where = f"{args.videos}: a clip cannot be read"  # which one would tell whoever leads the study
+            print(f"error: --videos {where}: {error.strerror}", file=sys.stderr, flush=True)
             raise HTTPException(503, "cannot be read") from None
         return video_response(content, request.headers.get("range"))
 
@@ -929,12 +974,15 @@ def main(args: Args) -> int:
 
 
 def cli(argv: list[str] | None = None) -> int:
-    """Run from the command line: a user's mistake is one line and exit code 2."""
+    """Run from the command line: a user's mistake is one line and exit code 2, a full disk one line and exit code 1."""
     try:
         return main(parse_args(argv))
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

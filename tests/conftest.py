@@ -93,7 +93,10 @@ def ends_before_it_is_killed(process: subprocess.Popen, seconds: float) -> bool:
 
 
 def modified(path: Path) -> int:
-    return path.stat().st_mtime_ns if path.exists() else 0
+    try:
+        return path.stat().st_mtime_ns
+    except FileNotFoundError:  # not written yet, or a run has just moved it to make room for the next
+        return 0
 
 
 def kill_twice(
@@ -140,6 +143,34 @@ class Counter(gym.Env):
         self.step_number += 1
         over, times_out = self.step_number == 4, self.episodes % 2 == 0
         return np.full(1, self.step_number, np.float32), 1.0, over and not times_out, over and times_out, {}
+
+
+class Moody(Counter):
+    """Knows no render mode; its infos differ in kind and shape from copy to copy."""
+
+    copies = 0
+
+    def __init__(self):
+        Moody.copies += 1
+        self.number = Moody.copies
+
+    def step(self, action):
+        *rest, _ = super().step(action)
+        return *rest, {"note": np.zeros(self.number) if self.number % 3 else None}
+
+
+class DiscreteMoody(Moody):
+    action_space = gym.spaces.Discrete(2)
+
+
+@pytest.fixture
+def moody():
+    """Ids of the two, while the test runs."""
+    for entry_point in (Moody, DiscreteMoody):
+        gym.register(f"{entry_point.__name__}-v0", entry_point)
+    yield "Moody-v0", "DiscreteMoody-v0"
+    for name in ("Moody-v0", "DiscreteMoody-v0"):
+        gym.registry.pop(name)
 
 
 def assert_boundaries_follow_their_logits(model) -> None:

@@ -569,3 +569,38 @@ def test_evaluation_and_demonstrations_play_in_the_mode_that_is_asked_for(tmp_pa
     assert np.abs(noise["greedy"]).max() < 1e-5 and set(scores["greedy"]).isdisjoint(scores["sampled"])
     quartiles = np.quantile(noise["sampled"] / math.exp(0.5), [0.25, 0.5, 0.75])  # of 600: bounds do not move them
     assert np.allclose(quartiles, Normal(0, 1).icdf(torch.tensor([0.25, 0.5, 0.75])), atol=0.15)
+
+
+def test_networks_that_would_not_be_played_or_trained_whole_are_refused():
+    agent = make_agent(make_args())
+    agent.actor_mean[1] = torch.nn.SiLU()
+    with pytest.raises(TypeError, match="SiLU"):
+        ppo.numpy_policy(agent)
+    agent.encoder = torch.nn.Linear(O, O)
+    with pytest.raises(ValueError, match="would not be trained"):
+        ppo.FlatAdam(agent, 3e-4, 1e-3)
+
+
+class SameArray(Counter):
+    """Gives the same array in every step, and changes the actions that it is given."""
+
+    def reset(self, **kwargs):
+        self.obs, infos = super().reset(**kwargs)
+        return self.obs, infos
+
+    def step(self, action):
+        action *= 0
+        self.obs[:], *rest = super().step(action)
+        return self.obs, *rest
+
+
+def test_demonstrations_are_copies():
+    args = make_args()
+    agent, env = make_agent(args, 1, 1), SameArray()
+    torch.nn.init.ones_(agent.actor_mean[-1].bias)
+    episode = ppo.play(agent, env, args, 1)
+    assert episode["observations"].ravel().tolist() == [0, 1, 2, 3, 4] and (episode["actions"] != 0).all()
+    player = ppo.Episode(env, 1, 0, 0.99)
+    player.start()
+    player.step(np.ones(1, np.float32))
+    assert player.actions[0].tolist() == [1]

@@ -212,6 +212,13 @@ def test_a_dqn_of_another_environment(tmp_path):
     assert json.loads((tmp_path / "run" / "result.json").read_text())["complete"]
 
 
+@pytest.mark.parametrize("method", [dqn, distill], ids=["dqn", "distill"])
+def test_environments_without_a_render_mode_and_with_odd_infos_are_evaluated(method, moody):
+    episodes = method.play(lambda obs: np.zeros(4, int), moody[1], [1, 2, 3, 4], keep=True)
+    assert [episode["rewards"].sum() for episode in episodes] == [4] * 4
+    assert episodes[3]["observations"].ravel().tolist() == [0, 1, 2, 3, 4]
+
+
 def test_the_game_by_its_full_name(tmp_path):
     name = ["--env-id", "cleanrl_thesis.dqn_apple:AppleGame-v0", "--run-dir", "run"]
     run(*SMALL_DQN[:-4], *name, "--total-timesteps", 2000, "--eval-episodes", 2, cwd=tmp_path, script=DQN)
@@ -468,6 +475,13 @@ def test_what_is_tested_on_is_not_trained_on(tmp_path, monkeypatch):
         return sorted(row.tobytes() for row in x.numpy())
 
     assert frames(torch.cat([obs[indices], tested[0]])) == frames(obs)
+
+
+@pytest.mark.parametrize("script", [DQN, DISTILL], ids=["dqn", "distill"])
+def test_parameters_that_explode_end_the_run(script, teacher, tmp_path):
+    flags = SMALL_DQN if script == DQN else [*SMALL_DISTILL, "--teacher", teacher]
+    done = run(*flags, "--learning-rate", 1e30, "--run-dir", "run", cwd=tmp_path, code=1, script=script)
+    assert "no longer finite" in done.stderr and not (tmp_path / "run" / "result.json").exists()
 
 
 def test_adam_gets_the_annealed_rates_and_three_tenths_are_explored(tmp_path, monkeypatch):

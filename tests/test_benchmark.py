@@ -14,11 +14,55 @@ from conftest import ROOT
 from scipy import stats
 
 sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
-from common import UsageError, run_main  # noqa: E402
+from common import UsageError, check_counts, kind_of, run_main, write_csv  # noqa: E402
 
 names = ("ppo_k10_report", "speed", "apple_report", "torcs_report")
 ppo_kle = importlib.import_module("report")
 report, speed, apple, torcs = map(importlib.import_module, names)
+
+
+TEXTS = {path.stem: path.read_text() for path in sorted((ROOT / "benchmark").glob("*.py"))}
+SCRIPTS = [name for name, text in TEXTS.items() if "run_main(main, Args" in text and "Positional" not in text]
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_a_script_starts_with_its_defaults(name):
+    check_counts(importlib.import_module(name).Args())
+
+
+@pytest.mark.parametrize(
+    "args, words",
+    [
+        (speed.Args("ppo", update_epochs=(10, 0)), "--update-epochs 10 0: must be at least 1"),
+        (speed.Args("ppo", 0), "0"),
+    ],
+)
+def test_counts_below_one_are_refused(args, words):
+    with pytest.raises(UsageError, match=words):
+        check_counts(args)
+
+
+def test_demonstrations_of_a_quick_human(tmp_path, monkeypatch):
+    """As the study's script sends it."""
+    monkeypatch.setattr(sys, "argv", ["apple_players.py", "--seed", "2", "--demos", str(tmp_path / "demos")])
+    players = importlib.import_module("apple_players")
+    run_main(players.main, players.Args, players.__doc__)
+    assert json.loads((tmp_path / "demos" / "manifest.json").read_text())["env_id"] == "AppleGame-v0"
+
+
+@pytest.mark.parametrize("name", ["alpha0.5_seed1", "T0.1_alpha0.50_seed2", "mix_alpha.5_seed10"])
+def test_kind_of_a_run(name, tmp_path):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "args.json").write_text('{"alpha": 0.5}')
+    assert kind_of(tmp_path / name) == re.sub(r"[\d.]+_seed\d+", "0.5", name)
+
+
+def test_a_table_that_cannot_be_written_leaves_the_one_before(tmp_path):
+    write_csv(tmp_path / "a.csv", [{"x": 1}])
+    for rows in ([], [{"x": 1}, {"y": 2}]):
+        with pytest.raises((IndexError, ValueError)):
+            write_csv(tmp_path / "a.csv", rows)
+    assert (tmp_path / "a.csv").read_text() == "x\n1\n" and len(list(tmp_path.iterdir())) == 1
 
 
 def test_interval_is_that_of_the_t_test():

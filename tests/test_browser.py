@@ -102,15 +102,16 @@ def test_what_is_recorded_is_what_was_pressed(env_id, tmp_path, capsys):
     """The keys in their order and for their times; the picture follows soon; the file plays to the same score."""
     plan = PLANS[env_id]
     with recorder(tmp_path / "anna", env_id) as page:
-        page.click("#record")
-        page.wait_for_selector("#veil", state="hidden", timeout=15_000)
-        times = hold(page, [*plan, ""])
-        deadline = time.time() + 180
-        while (
-            not page.is_enabled("#record") and time.time() < deadline
-        ):  # Gopher waits for the button, the car for the gas
-            hold(page, ["fire up", ""])
-        shown = page.inner_text("#message")
+        for _ in range(3):  # beside other tests a round may be too slow to be kept
+            page.click("#record")
+            page.wait_for_selector("#veil", state="hidden", timeout=15_000)
+            times = hold(page, [*plan, ""])
+            deadline = time.time() + 180
+            while not page.is_enabled("#record") and time.time() < deadline:
+                hold(page, ["fire up", ""])  # Gopher waits for the button, the car for the gas
+            shown = page.inner_text("#message")
+            if "is not kept" not in shown:
+                break
         latencies = page.evaluate("latencies")
     with np.load(tmp_path / "anna" / "episode_00000.npz", allow_pickle=False) as arrays:
         episode = dict(arrays)
@@ -144,15 +145,18 @@ def test_a_round_whose_page_loses_focus_is_not_kept(tmp_path):
         page.wait_for_selector("#record:enabled", timeout=5_000)
         assert "lost focus" in page.inner_text("#message") and "lost focus" in page.inner_text("#veil")
         assert not list((tmp_path / "anna").iterdir())
-        page.click("#record")
-        page.wait_for_selector("#stop:visible")
-        page.wait_for_selector("#record:enabled", timeout=60_000)
+        for _ in range(3):
+            page.click("#record")
+            page.wait_for_selector("#stop:visible")
+            page.wait_for_selector("#record:enabled", timeout=60_000)
+            if "is not kept" not in page.inner_text("#message"):
+                break
     with np.load(tmp_path / "anna" / "episode_00000.npz", allow_pickle=False) as arrays:
         assert (arrays["actions"] == 4).all()  # the key that was down is not held any more
 
 
 def test_a_round_of_a_browser_that_fell_silent_is_not_kept(tmp_path):
-    """The connection holds, but nothing is drawn: the round is over a second after its beginning."""
+    """The connection holds, but nothing is drawn: the round is over half a second after its beginning."""
     process, address = start(RECORD, "--player", "anna", "--out", tmp_path / "anna", "--port", 0)
     with websockets.sync.client.connect(address.replace("http", "ws") + "/play", origin=address) as socket:
         socket.send('{"order": "record"}')
@@ -160,7 +164,7 @@ def test_a_round_of_a_browser_that_fell_silent_is_not_kept(tmp_path):
         times = {message["kind"]: (time.perf_counter(), message) for message in itertools.islice(texts, 6)}
     assert list(times) == ["ready", "countdown", "go", "over"]  # of three countdowns the last
     assert times["over"][1]["trouble"] == record.SILENT and times["over"][1]["recorded"] is False
-    assert 0.8 < times["over"][0] - times["go"][0] < 3
+    assert 0.4 < times["over"][0] - times["go"][0] < 3
     process.terminate()
     assert process.wait(10) == 0 and not (tmp_path / "anna").exists()
 
@@ -197,7 +201,8 @@ async def load(go) -> None:
             await go()
             return
         except Error as error:
-            assert "ERR_CONNECTION" in str(error) or "ERR_EMPTY_RESPONSE" in str(error), error
+            reasons = "ERR_CONNECTION", "ERR_EMPTY_RESPONSE", "chrome-error"  # the browser's own page of these
+            assert any(reason in str(error) for reason in reasons), error
             await asyncio.sleep(0.5)
     raise AssertionError("the server does not come back")
 
@@ -273,17 +278,75 @@ async def everyone(server: Server, people: int) -> list[tuple[str, list[tuple[st
     return results
 
 
+def write_videos(folder: Path, frames: int = 10) -> None:
+    """Four clips of each of three agents, 20 frames a second."""
+    for seed, (agent, i) in enumerate(itertools.product(("human", "hybrid", "dqn"), range(4))):
+        (folder / agent).mkdir(parents=True, exist_ok=True)
+        rng = np.random.default_rng(seed)
+        pictures = (rng.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(frames))
+        study.write_clip(folder / agent / f"{i}.mp4", pictures, 20)
+
+
+def test_a_clip_is_watched_whole_and_a_key_is_of_one_study(tmp_path):
+    """Paused, it begins anew, and nothing is asked; what the browser keeps of another study at the address is forgotten."""
+    write_videos(tmp_path / "videos", 60)
+    process, address = start(STUDY, "--videos", tmp_path / "videos", "--db", tmp_path / "study.sqlite", "--port", 0)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(**LAUNCH)
+        page, errors = browser.new_page(), []
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.add_init_script(f"localStorage.participant ??= '{'ab' * 16}'")
+        page.goto(address)
+        page.wait_for_selector("#consent:visible")
+        assert page.evaluate("localStorage.participant") is None
+        page.check("#agree")
+        page.click("#join")
+        page.click("#start")
+        page.click("#play")
+        seconds, deadline = 0.0, time.time() + 20
+        while seconds < 0.5 and time.time() < deadline:
+            seconds = page.evaluate("document.getElementById('video').currentTime")
+        assert seconds >= 0.5 and page.is_disabled("#play")
+        page.evaluate("document.getElementById('video').pause()")
+        page.wait_for_selector("#play:enabled", timeout=5_000)
+        assert page.inner_text("#play") == "Play the clip" and not page.is_visible("#question")
+        assert page.evaluate("document.getElementById('video').currentTime") == 0
+        page.click("#play")
+        page.wait_for_selector("#question:visible", timeout=20_000)
+        assert page.inner_text("#play") == "Watch again" and page.is_disabled("#send")
+        assert page.evaluate("document.getElementById('video').src").startswith("blob:")
+        browser.close()
+    process.terminate()
+    assert process.wait(10) == 0 and errors == []
+
+
+def test_the_game_fits_the_screen(tmp_path):
+    """All of Gopher's tall picture is on a small laptop's screen."""
+    process, address = start(RECORD, "--env-id", "ALE/Gopher-v5", "--practice", "--port", 0)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(**LAUNCH)
+        page = browser.new_page(viewport={"width": 1366, "height": 600})
+        page.goto(address)
+        page.wait_for_selector("#practice:enabled")
+        page.click("#practice")
+        page.wait_for_selector("#veil", state="hidden", timeout=15_000)
+        box = page.locator("#canvas").bounding_box()
+        assert box["y"] >= 0 and box["y"] + box["height"] <= 600 and box["height"] > 500
+        assert box["height"] / box["width"] == pytest.approx(210 / 160, rel=0.01)
+        browser.close()
+    process.terminate()
+    assert process.wait(10) == 0
+
+
 def test_a_study_of_26_participants(tmp_path):
     """Every answer given is there once, and the table counts what was said."""
-    for seed, (agent, i) in enumerate(itertools.product(("human", "hybrid", "dqn"), range(4))):
-        (tmp_path / "videos" / agent).mkdir(parents=True, exist_ok=True)
-        rng = np.random.default_rng(seed)
-        frames = (rng.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(10))
-        study.write_clip(tmp_path / "videos" / agent / f"{i}.mp4", frames, 20)
+    write_videos(tmp_path / "videos")
     db = tmp_path / "study.sqlite"
     server = Server("--videos", tmp_path / "videos", "--db", db)
-    results = asyncio.run(everyone(server, 26))
-    server.process.terminate()
+    try:
+        results = asyncio.run(everyone(server, 26))
+    finally:
+        server.process.terminate()
     assert server.process.wait(10) == 0
     with contextlib.closing(sqlite3.connect(db)) as connection:
         query = "SELECT key, verdict, why, agent, age FROM trials JOIN participants USING (participant) JOIN clips USING (clip)"
@@ -294,7 +357,7 @@ def test_a_study_of_26_participants(tmp_path):
     assert study.cli(["--db", str(db), "--export", str(tmp_path / "results")]) == 0
     lines = (tmp_path / "results" / "identified_as_human.csv").read_text().splitlines()[1:]
     for line in lines:
-        agent, human, judged, *_, people = line.split(",")
+        agent, human, judged, *_, people, clips = line.split(",")
         verdicts = [row[1] for row in stored if row[3] == agent]
-        assert (int(human), int(judged), int(people)) == (verdicts.count("human"), 52, 26)
+        assert (int(human), int(judged), int(people), int(clips)) == (verdicts.count("human"), 52, 26, 4)
     assert len(lines) == 3

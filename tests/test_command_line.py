@@ -318,6 +318,12 @@ def test_a_run_that_did_not_begin_can_be_sent_again(tmp_path):
     assert (tmp_path / "run" / "result.json").exists()
 
 
+def test_parameters_that_explode_end_the_run(tmp_path):
+    flags = [*SMALL, "--learning-rate", 1e30, "--max-grad-norm", "inf", "--run-dir", "run"]
+    done = run(*flags, cwd=tmp_path, code=1)
+    assert "no longer finite" in done.stderr and not (tmp_path / "run" / "result.json").exists()
+
+
 def test_too_little_memory_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(ppo, "Agent", lambda *its: torch.empty(2**60))

@@ -175,6 +175,23 @@ def test_what_is_own_is_alike_where_it_can_be(name):
         assert len({found[file][name] for file in files}) == 1, (name, files)
 
 
+def methods_of(source: str, name: str) -> dict[str, str]:
+    """Each method of a class, as the dump of its syntax tree."""
+    body = next(node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == name).body
+    return {node.name: ast.dump(node) for node in body if isinstance(node, ast.FunctionDef)}
+
+
+@pytest.mark.parametrize(
+    "name, methods", [("Collector", ("__init__", "reset", "step")), ("Player", ("observe", "act_randomly"))]
+)
+def test_agents_with_skills_play_as_those_without(name, methods):
+    """Only what they keep, and how they act, is their own."""
+    files = [path for path in METHODS if path.name in (DREAMER, HWM_DREAMER, HRL)]
+    found = [methods_of(path.read_text(), name) for path in files]
+    for method in methods:
+        assert len({each[method] for each in found}) == 1 and len(found) == 3, method
+
+
 def test_no_method_imports_another():
     for path in METHODS:
         forbidden = {"cleanrl_thesis", ".", *(other.stem for other in METHODS)}

@@ -248,17 +248,39 @@ def test_frames_are_labelled_by_the_teacher_where_the_term_asks(states):
             obs = env.step(int(teacher(row[None]).argmax()))[0]
 
 
-def test_agreement_and_loss_on_test_frames_by_hand():
-    student, update, data, args = make_update()
+@pytest.mark.parametrize("states", ["human", "own"])
+def test_agreement_and_loss_on_test_frames_by_hand(states):
+    student, update, data, args = make_update(states=states)
     numbers = distill.measure(student, data, args)
     agrees_rl = agrees_human = 0
     with torch.no_grad():
+        rl_logs, he_logs = (student(obs).log_softmax(1) for obs in (data.rl_obs, data.he_obs))
         for i in range(64):
             agrees_rl += int(student(data.rl_obs[i : i + 1]).argmax()) == int(data.rl_labels[i].argmax())
             agrees_human += int(student(data.he_obs[i : i + 1]).argmax()) == int(data.he_actions[i])
     assert numbers["test/accuracy_human"] == pytest.approx(agrees_human / 64)
+    assert numbers["test/accuracy_rl"] == pytest.approx(agrees_rl / 64)
+    rl, he = -(data.rl_labels * rl_logs).sum(1).mean(), -he_logs[range(64), data.he_actions].mean()
+    assert numbers["test/loss"] == pytest.approx((args.alpha * rl + (1 - args.alpha) * he).item(), rel=1e-5)
     expected = (args.alpha * agrees_rl + (1 - args.alpha) * agrees_human) / 64
     assert numbers["test/accuracy"] == pytest.approx(expected)
+
+
+def test_an_epoch_takes_each_training_frame_once_in_another_order():
+    """A last minibatch of fewer frames is left out."""
+    obs, training, seen = torch.arange(100.0)[:, None], torch.arange(1, 100, 2)[:47], []
+    data = distill.Data(obs, torch.zeros(100, 2), obs, torch.zeros(100, dtype=torch.long))
+
+    def update(minibatch, masks):
+        seen.append(minibatch.he_obs[:, 0].int().tolist())
+        return torch.zeros(2).unbind()
+
+    for _ in range(2):
+        distill.train_epoch(update, data, training, distill.Args(batch_size=10, hidden_size=4))
+    assert [len(frames) for frames in seen] == 8 * [10]
+    one, two = sum(seen[:4], []), sum(seen[4:], [])
+    assert one != sorted(one) and one != two
+    assert len(set(one)) == len(set(two)) == 40 and set(one + two) <= set(training.tolist())
 
 
 # The synthetic human

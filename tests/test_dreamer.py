@@ -361,6 +361,27 @@ def test_frames_are_normalised():
     assert sizes.max() == pytest.approx(1, abs=1e-2) and sizes.min() > 0.05
 
 
+def test_pictures_of_the_convolutions_are_between_minus_and_plus_a_half():
+    """Nothing behind the decoder's last layer bounds them."""
+    args = method.complete_args(method.Args(size="m", depth=1))
+    model = method.WorldModel(args, 3)
+    method.set_frame_statistics(model, args)
+    ends = model.normalize(torch.tensor([0, 255], dtype=torch.uint8)[:, None, None, None].expand(2, 64, 64, 3))
+    assert ends[0].unique().tolist() == [-0.5] and ends[1].unique().tolist() == [0.5]
+    with torch.no_grad():
+        model.decoder.layers[-1].weight.zero_()
+        model.decoder.layers[-1].bias.fill_(-0.5)
+        assert (model.decoder(torch.randn(2, model.feature_size)) == -0.5).all()
+
+
+def test_the_posterior_knows_the_past_and_the_frame():
+    model = make_learner().model
+    deter, embed = torch.randn(2, 12), torch.randn(2, 16)
+    plain = model.posterior(deter, embed)
+    assert not torch.allclose(plain, model.posterior(deter + 1, embed))
+    assert not torch.allclose(plain, model.posterior(deter, embed + 1))
+
+
 # Returns and the dream
 def brute_force_return(rewards, discounts, values, gae_lambda, h) -> float:
     """The mean of all n-step returns from step h, weighed by (1 − λ) λ^(n − 1), the rest on the longest (Sutton & Barto)."""
@@ -962,9 +983,27 @@ def test_a_full_disk_is_one_line_before_the_first_step(tmp_path, monkeypatch):
     assert not (tmp_path / "run" / "episodes.csv").exists()
 
 
-def test_losses_that_explode_end_the_run(tmp_path):
+def test_parameters_that_explode_end_the_run(tmp_path):
     flags = [*SMALL, "--model-learning-rate", 1e30, "--max-grad-norm", "inf", "--run-dir", "run"]
     done = run(*flags, cwd=tmp_path, code=1, script=SCRIPT)
+    assert "no longer finite" in done.stderr and not (tmp_path / "run" / "result.json").exists()
+
+
+@pytest.mark.parametrize("name", ["dreamer_v2", "hwm_dreamer", "hwm_hrl_dreamer"])
+def test_parameters_that_explode_with_the_last_update_end_the_run(name, tmp_path, monkeypatch):
+    """Its losses, which are from before the step, are finite."""
+    agent = importlib.import_module(f"cleanrl_thesis.{name}")
+    update = agent.Learner.update
+
+    def explode(learner, data):
+        metrics = update(learner, data)
+        next(learner.behaviour.parameters()).data.fill_(math.nan)
+        return metrics
+
+    monkeypatch.setattr(agent.Learner, "update", explode)
+    flags = ["--batch-size", 1, "--chunk-length", 4, "--horizon", 2, "--prefill", 500, "--total-timesteps", 1000]
+    flags += ["--train-frequency", 500, "--eval-episodes", 1, "--run-dir", "run"]
+    done = run(*flags, cwd=tmp_path, code=1, script=ROOT / "cleanrl_thesis" / f"{name}.py")
     assert "no longer finite" in done.stderr and not (tmp_path / "run" / "result.json").exists()
 
 
@@ -997,7 +1036,7 @@ def test_the_dream_starts_from_what_was_seen(small_run, tmp_path):
 
 
 class Shortest:
-    """Reads a game's state from its frame and goes a shortest way."""
+    """Reads a game's state from its frame and goes a shortest path."""
 
     greedy: list[bool] = []
 
@@ -1014,6 +1053,15 @@ class Shortest:
     def act(self, greedy: bool = False) -> np.ndarray:
         self.greedy.append(greedy)
         return np.array([self.after[pose, :, goal].argmin() for pose, goal in self.states])
+
+
+def test_a_player_of_shortest_ways_has_the_optimal_return(tmp_path, monkeypatch):
+    learner, picture = make_learner(eval_episodes=50), np.zeros((2, 22, 22, 3), np.uint8)
+    monkeypatch.setattr(method, "Player", Shortest)
+    monkeypatch.setattr(method, "dream_frames", lambda *_: (picture, picture))
+    monkeypatch.setattr(method, "compare_dream", lambda *_: {})
+    evaluation = method.evaluate(learner, learner.args, tmp_path)
+    assert evaluation["mean"] == pytest.approx(evaluation["optimal"]) and evaluation["solved"] == 1
 
 
 @pytest.mark.parametrize("greedy", [True, False])
@@ -1115,7 +1163,7 @@ def test_steps_to_a_return_and_curves(tmp_path):
         dreamer_report.read_runs(tmp_path / "runs")
 
 
-def test_goals_by_what_the_replay_paid(small_run, capsys):
+def test_goals_by_what_the_replay_paid(small_run, tmp_path, capsys):
     dreamer_goals.main(dreamer_goals.Args(small_run, episodes=50))
     lines = capsys.readouterr().out.splitlines()
     rewards = int(lines[0].split()[-2])
@@ -1125,6 +1173,9 @@ def test_goals_by_what_the_replay_paid(small_run, capsys):
     assert cells == 64 and played == 50
     with pytest.raises(UsageError, match="no checkpoint"):
         dreamer_goals.main(dreamer_goals.Args(small_run.parent))
+    torch.save({"format": "ppo_fourrooms 1"}, tmp_path / "checkpoint.pt")
+    with pytest.raises(UsageError, match="no checkpoint"):
+        dreamer_goals.main(dreamer_goals.Args(tmp_path))
     with pytest.raises(UsageError, match="whose model has no segments"):
         dreamer_reads.main(dreamer_reads.Args(small_run))
 

@@ -4,6 +4,7 @@ import csv
 import importlib
 import itertools
 import json
+import math
 import os
 import shutil
 import signal
@@ -20,6 +21,7 @@ import safetensors.torch
 import torch
 from conftest import (
     ROOT,
+    Counter,
     as_a_process_of_its_own,
     assert_refused,
     command,
@@ -156,6 +158,18 @@ def test_runs_leave_what_the_readme_says(expert, student):
     events = {path.name for path in (*expert.iterdir(), *student.iterdir()) if "tfevents" in path.name}
     assert {path.name for path in expert.iterdir()} - events == {*shared, "replay.dat"}
     assert {path.name for path in student.iterdir()} - events == {*shared, "demos_synthetic_human"}
+
+
+def test_a_student_has_the_statistics_of_what_it_learned_from(student, expert):
+    """Of all observations at which its experts act, every second one."""
+    seen = []
+    for folder in (expert / "demos", student / "demos_synthetic_human"):
+        for path in folder.glob("*.npz"):
+            with np.load(path) as arrays:
+                seen.append(arrays["observations"][:-1][::2])
+    saved, seen = safetensors.torch.load_file(student / "model.safetensors"), torch.from_numpy(np.concatenate(seen))
+    assert torch.allclose(saved["obs_mean"], seen.mean(0), atol=1e-4)
+    assert torch.allclose(saved["obs_std"], seen.std(0).clamp(min=1e-3), rtol=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["expert", "student"])
@@ -387,6 +401,18 @@ def test_the_video_is_the_first_evaluation_episode(mode, student, tmp_path, monk
     assert len(filmed) == 1 and played == pytest.approx(evaluation[mode]["returns"][0], rel=1e-6)
 
 
+@pytest.mark.parametrize("script", [DDPG, GAIL], ids=["ddpg", "gail"])
+def test_parameters_that_explode_end_the_run(script, expert, tmp_path):
+    flags = [*SMALL_DDPG] if script == DDPG else [*SMALL_GAIL, "--demos-rl", expert / "demos"]
+    flags += ["--learning-rate" if script == DDPG else "--value-learning-rate", 1e30]  # TRPO's step has a bound
+    done = run(*flags, "--run-dir", "run", cwd=tmp_path, code=1, script=script)
+    assert "no longer finite" in done.stderr and not (tmp_path / "run" / "result.json").exists()
+
+
+class WholeActions(Counter):
+    action_space = gym.spaces.Box(-3, 3, (1,), np.int64)
+
+
 def test_actions_of_float64_are_bounded_in_float32():
     gym.register("Doubles-v0", lambda **_: DoubleActions(gym.make("Pendulum-v1")))
     try:
@@ -396,6 +422,32 @@ def test_actions_of_float64_are_bounded_in_float32():
     actions = np.array([[3.0], [-0.5]], np.float32)
     assert space.low.dtype == space.high.dtype == gail.bounded(actions, space.low, space.high).dtype == np.float32
     assert gail.bounded(actions, space.low, space.high).tolist() == [[2.0], [-0.5]]
+
+
+@pytest.mark.parametrize("method", [ddpg, gail], ids=["ddpg", "gail"])
+def test_environments_without_a_render_mode_and_with_odd_infos_are_evaluated(method, moody):
+    games = method.make_games(method.Args(env_id=moody[0]), 4)
+    episodes = method.play(lambda obs: np.zeros((4, 1), np.float32), games, [1, 2, 3, 4], keep=True)
+    assert [episode["rewards"].sum() for episode in episodes] == [4] * 4
+    assert episodes[3]["observations"].ravel().tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("method", [ddpg, gail], ids=["ddpg", "gail"])
+def test_actions_that_are_whole_numbers_are_refused(method):
+    gym.register("Whole-v0", WholeActions)
+    try:
+        with pytest.raises(method.UsageError, match="--env-id Whole-v0: needs .* floats"):
+            method.make_env("Whole-v0")
+    finally:
+        gym.registry.pop("Whole-v0")
+
+
+def test_a_network_that_the_numpy_twin_does_not_know_is_refused():
+    agent = gail.Agent(3, 1, 8)
+    gail.numpy_mean(agent)
+    agent.actor_mean.insert(1, torch.nn.LayerNorm(8))
+    with pytest.raises(TypeError, match="LayerNorm"):
+        gail.numpy_mean(agent)
 
 
 @pytest.mark.slow
@@ -497,6 +549,30 @@ def test_the_experts_are_in_their_places(expert, tmp_path, monkeypatch):
         with np.load(folder / "episode_00000.npz") as arrays:
             first = arrays["actions"][::2].astype(np.float32).clip(-1, 1)
         assert np.allclose(expert_demos.actions[: len(first)], first)
+
+
+def test_noise_is_drawn_and_adapted_when_it_should(tmp_path, monkeypatch):
+    """Anew with each episode, and in all environments every 100 steps of 5; its size at every 50th update."""
+    begun, adapted, noise = [], [], ddpg.ParameterNoise
+    begin, adapt = noise.begin, noise.adapt
+    monkeypatch.setattr(noise, "begin", lambda self, i: begun.append(i) or begin(self, i))
+    monkeypatch.setattr(noise, "adapt", lambda self, obs: adapted.append(1) or adapt(self, obs))
+    run(*SMALL_DDPG, "--keep-best-every", 0, "--run-dir", "run", cwd=tmp_path, script=DDPG)
+    ended = len(ddpg.read_episodes(tmp_path / "run"))
+    args = json.loads((tmp_path / "run" / "args.json").read_text())
+    actions = args["total_timesteps"] // (args["num_envs"] * args["frame_skip"])
+    assert len(begun) == 5 + ended + 5 * (actions // (100 // args["frame_skip"]))
+    updates = args["train_steps"] * (args["total_timesteps"] // args["rollout_steps"])
+    assert len(adapted) == math.ceil(updates / args["adapt_interval"]) > 1 and ended > 5
+
+
+def test_evaluation_counts_metres_whatever_the_reward():
+    games = ddpg.make_games(ddpg.Args(reward="speed"), 2)
+    games.reset(seed=[1, 2])
+    for _ in range(30):
+        _, rewards, _, _, infos = games.step(np.full((2, 2), [0.0, 0.5]))
+        assert np.array_equal(rewards, infos["progress"]) and (rewards < 2).all()
+    assert rewards.min() > 0.01
 
 
 def test_the_kl_bound_falls_and_the_discriminator_learns_every_third_time(expert, tmp_path, monkeypatch):

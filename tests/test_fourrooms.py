@@ -156,7 +156,7 @@ def test_rewards_and_time_outs():
     env.games.poses[:], env.games.goals[:] = 4 * start, [maze.cell_at[4, 1], maze.cell_at[9, 9]]
     for step in range(1, 101):
         before = env.games.poses[1]
-        _, rewards, terminated, truncated, _ = env.step(np.array([method.FORWARD if step <= 3 else 0, method.LEFT]))
+        _, rewards, terminated, truncated, _ = env.step(np.array([2 if step <= 3 else 0, 0]))
         if step == 3:
             assert terminated.tolist() == [True, False] and rewards.tolist() == [1 - 0.9 * 0.03, 0]
         assert truncated[1] == (step == 100) and not terminated[1] and rewards[1] == 0

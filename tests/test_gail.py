@@ -1,5 +1,6 @@
 """TRPO, the hybrid discriminator and the synthetic driver against independent sources."""
 
+import importlib
 import math
 
 import gymnasium as gym
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.sparse.linalg
 import torch
+from conftest import ROOT, Counter
 from sb3_contrib import TRPO
 
 from cleanrl_thesis import gail_hybrid as gail
@@ -249,6 +251,24 @@ def test_a_rollout_holds_each_action():
         assert np.array_equal(next_obs, cars.obs)
 
 
+def test_ends_and_time_outs_of_a_rollout():
+    """Two games that end after 4 steps, the first time by an end, the second by a time-out."""
+    args = gail.Args(num_envs=2, num_steps=8, frame_skip=1)
+    players = gail.GymPlayers([Counter(), Counter()], 0)
+    players.start()
+    rollout = gail.collect(gail.Agent(1, 1, 8), players, Counter.action_space, args, np.random.default_rng(0))
+    for i in range(2):
+        assert np.flatnonzero(rollout.ended[:, i]).tolist() == [3, 7]
+        assert np.flatnonzero(rollout.terminated[:, i]).tolist() == [3]
+        assert rollout.obs[:, i, 0].tolist() == 2 * [0, 1, 2, 3] and rollout.next_obs[:, i, 0].tolist() == 2 * [
+            1,
+            2,
+            3,
+            4,
+        ]
+    assert rollout.episodes == [(8, 4.0, 4)] * 2 + [(16, 4.0, 4)] * 2
+
+
 def test_gradient_penalty():
     """Of a plane it is (slope - 1)²; of a network, the mean over points between, by differences in double precision."""
     torch.manual_seed(0)
@@ -345,6 +365,14 @@ def test_behaviour_cloning_mixes_two_actions_into_one_between_them():
     assert agent.actor_logstd.exp().item() == pytest.approx(spread, rel=0.1)
 
 
+def test_trpo_alone_has_the_environments_rewards(monkeypatch):
+    """As benchmark/trpo_returns.py has it beside sb3-contrib's: the pendulum's return is the length of its episode."""
+    monkeypatch.syspath_prepend(ROOT / "benchmark")
+    trpo = importlib.import_module("trpo_returns")
+    returns = trpo.last_returns(trpo.Args(env_id="InvertedPendulum-v5", batches=1), 1)
+    assert 10 < len(returns) <= 50 and all(value == int(value) >= 0 for value in returns) and sum(returns) > 50
+
+
 # From the demonstrations to the update
 SPACE = gym.spaces.Box(-1, 1, (1,))
 
@@ -372,6 +400,37 @@ def test_alpha_is_the_weight_of_the_reinforcement_learning_expert(alpha):
         )
     rl, human = (agent.logits(torch.tensor([[0.0] * OBS + [action]])).item() for action in (1.0, -1.0))
     assert (rl < 0 < human) if alpha else (human < 0 < rl)
+
+
+def test_the_discriminator_sees_student_and_experts_alike():
+    """Observations normalised on both sides, and the actions as the environment had them, within its bounds."""
+    agent, seen = gail.Agent(OBS, 1, 8), []
+    agent.set_normalization(5 + 3 * torch.randn(200, OBS))
+    logits = agent.logits
+    agent.logits = lambda pairs: seen.append(pairs.detach()) or logits(pairs)
+    batch = of_student(3.0, 20)._replace(seen=torch.ones(20, 1), obs=torch.full((20, OBS), 0.5))
+    adam = torch.optim.SGD(agent.discriminator.parameters(), 0.0)
+    experts, args = gail.Experts(one_action(1.0), one_action(-1.0)), gail.Args(alpha=0.5, d_grad_penalty=0.0, d_steps=1)
+    gail.update_discriminator(agent, adam, batch, experts, args)
+    zero = agent.normalize(torch.zeros(1, OBS)).expand(20, -1)
+    assert torch.equal(seen[0], torch.cat([batch.obs, batch.seen], 1)) and zero.abs().min() > 1
+    for pairs, action in zip(seen[1:], (1.0, -1.0), strict=True):
+        assert torch.allclose(pairs, torch.cat([zero, torch.full((20, 1), action)], 1))
+
+
+def test_a_clone_acts_on_normalised_observations():
+    """The expert steers by how far its first observation is from the mean."""
+    torch.manual_seed(0)
+    agent, obs = gail.Agent(OBS, 1, 32), 5 + 3 * torch.randn(4_001, OBS)
+    agent.set_normalization(obs)
+    actions = 0.3 * agent.normalize(obs)[:-1, :1]
+    expert = gail.Demonstrations(
+        [{"observations": obs.numpy(), "actions": actions.numpy()}], gym.spaces.Box(-9, 9, (1,)), 1
+    )
+    gail.behaviour_cloning(agent, gail.Experts(expert, expert), gail.Args(alpha=0.5, bc_epochs=60))
+    with torch.no_grad():
+        found = agent.actor_mean(agent.normalize(obs))[:-1]
+    assert (found - actions).square().mean() < 0.05 * actions.var()
 
 
 def test_each_experts_penalty_has_its_weight(monkeypatch):

@@ -5,12 +5,14 @@ import fcntl
 import functools
 import importlib
 import json
+import math
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import ale_py
@@ -221,26 +223,47 @@ def test_the_first_layer_sees_the_brightness_between_0_and_1():
     assert torch.allclose(network.features(obs), x.flatten(1), atol=1e-5)
 
 
-def test_an_update_is_adams_on_the_huber_loss():
+@pytest.mark.parametrize("double", [True, False])
+def test_an_update_is_adams_on_the_huber_loss(double):
     torch.manual_seed(2)
-    args = dqn.Args(obs_type="ram", double=True)
+    args = dqn.Args(obs_type="ram", double=double)
     learner = dqn.Learner(lambda: dqn.AtariQNetwork((1, 128), 3, 8, True), args, torch.device("cpu"))
     with torch.no_grad():
         for parameter in learner.target_network.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
     obs, next_obs = (torch.randint(0, 256, (5, 1, 128), dtype=torch.uint8) for _ in range(2))
     minibatch = dqn.Minibatch(obs, torch.tensor([0, 1, 2, 0, 1]), torch.randn(5), 0.9 * torch.ones(5), next_obs)
-    q, choice = learner.agent(obs), learner.agent(next_obs).argmax(1)
+    q, choice = learner.agent(obs), (learner.agent if double else learner.target_network)(next_obs).argmax(1)
     target = minibatch.returns + 0.9 * learner.target_network(next_obs)[range(5), choice].detach()
     error = q[range(5), minibatch.actions] - target
     loss = torch.where(error.abs() < 1, 0.5 * error**2, error.abs() - 0.5).mean()
     gradients = torch.autograd.grad(loss, list(learner.agent.parameters()))
-    norm = torch.cat([gradient.flatten() for gradient in gradients]).norm()
     before = [parameter.detach().clone() for parameter in learner.agent.parameters()]
     learner.update(minibatch, 1e-3)
     for parameter, old, gradient in zip(learner.agent.parameters(), before, gradients):
-        gradient = gradient * min(1, 10 / norm)
         assert torch.allclose(parameter, old - 1e-3 * gradient / (gradient.abs() + 1e-8), atol=1e-6)
+
+
+@pytest.mark.parametrize("bound", [1e-3, math.inf])
+def test_the_norm_of_all_gradients_together_is_bounded(bound):
+    torch.manual_seed(2)
+    args = dqn.Args(obs_type="ram", max_grad_norm=bound)
+    learner = dqn.Learner(lambda: dqn.AtariQNetwork((1, 128), 3, 8, True), args, torch.device("cpu"))
+    obs = torch.randint(0, 256, (5, 1, 128), dtype=torch.uint8)
+    learner.update(dqn.Minibatch(obs, torch.tensor([0, 1, 2, 0, 1]), torch.full((5,), 5.0), torch.zeros(5), obs), 1e-3)
+    norm = torch.cat([parameter.grad.flatten() for parameter in learner.agent.parameters()]).norm().item()
+    assert norm == pytest.approx(1e-3, rel=0.01) if bound < 1 else norm > 0.1
+
+
+def test_the_dueling_heads_are_a_value_and_advantages_without_mean():
+    torch.manual_seed(2)
+    network = dqn.AtariQNetwork((1, 128), 3, 8, True)
+    obs = torch.randint(0, 256, (5, 1, 128), dtype=torch.uint8)
+    with torch.no_grad():
+        hidden = torch.relu(network.hidden(network.features(obs)))
+        q, value, advantage = network(obs), network.value(hidden[:, :4]), network.advantage(hidden[:, 4:])
+    assert torch.allclose(q.mean(1, keepdim=True), value, atol=1e-6)
+    assert torch.allclose(q - value, advantage - advantage.mean(1, keepdim=True), atol=1e-6)
 
 
 def test_rewards_of_each_life():
@@ -509,6 +532,20 @@ SMALL_DISTILL = [
 ]
 
 
+def test_learning_from_the_first_frame(tmp_path):
+    """There is no minibatch before the ring has a stack of frames and n steps."""
+    flags = [*RAM, "--total-timesteps", 1_600, "--learning-starts", 0, "--n-step", 9, "--train-frequency", 4]
+    run(*flags, "--num-envs", 2, "--run-dir", "run", cwd=tmp_path, script=SCRIPT)
+    with open(tmp_path / "run" / "updates.csv", newline="") as file:
+        updates = sum(int(row["charts/updates"]) for row in csv.DictReader(file))
+    assert 2 * (200 - 11) <= updates < 2 * 200  # two for each of 200 steps, but the first ten or so
+
+
+def test_parameters_that_explode_end_the_run(tmp_path):
+    done = run(*SMALL, "--learning-rate", 1e30, "--run-dir", "run", cwd=tmp_path, code=1, script=SCRIPT)
+    assert "no longer finite" in done.stderr and not (tmp_path / "run" / "result.json").exists()
+
+
 @pytest.fixture(scope="session")
 def pixel_teacher(tmp_path_factory) -> Path:
     """A DQN on pixels that has hardly begun to learn."""
@@ -722,6 +759,27 @@ def test_recordings_of_gopher_are_played_again_and_learned_from(student, pixel_t
     assert human["rewards_per_life"]["mean"] == pytest.approx(paid / lives)
 
 
+def test_lives_of_the_players_report_are_those_of_the_method(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmark")
+    players = importlib.import_module("gopher_players")
+    episode = {"lives": np.array([3, 3, 2, 2, 1, 0]), "rewards": np.array([20.0, 0, 100, 0, 20, 20])}
+    scores = {unit: score(distill, episode) for unit, score in players.UNITS.items()}
+    assert scores["rewards of a life"] == [(part > 0).sum() for part in players.lives_of(distill, episode)] == [2, 1, 1]
+    assert scores["points of a life / 20"] == [6, 1, 1] and scores["points of a game"] == [160]
+
+
+def test_demonstrations_of_a_quick_human_are_read_by_a_student(tmp_path, monkeypatch):
+    """As gopher_alpha.sh has them made, but of less play."""
+    monkeypatch.syspath_prepend(ROOT / "benchmark")
+    players = importlib.import_module("gopher_players")
+    method = players.load_method("distill_hybrid")
+    complete = method.complete_args
+    monkeypatch.setattr(method, "complete_args", lambda args: complete(replace(args, demo_frames=200, test_frames=50)))
+    players.write_quick_demonstrations(method, players.Args(seed=2, demos=tmp_path / "demos"))
+    (episode,) = distill.read_demonstrations(tmp_path / "demos", "ALE/Gopher-v5", 200)
+    assert len(episode["actions"]) >= 200 and method.SyntheticGopherHuman.reaction == 2
+
+
 def test_frames_of_a_person_are_what_an_agent_would_see(student):
     """Actions held for 4 frames, given as one for each frame: every fourth stack is the one that was seen."""
     path = sorted((student / "demos").glob("*.npz"))[0]
@@ -753,8 +811,10 @@ def test_frames_of_a_person_are_what_an_agent_would_see(student):
         (lambda f: rewrite(f, lambda a: {k: v for k, v in a.items() if k != "seed"}), ["no demonstration"]),
         (lambda f: edit_manifest(f, lambda m: m["options"].update(frame_skip=3)), ["frame_skip", "3"]),
         (lambda f: edit_manifest(f, lambda m: m["options"].update(frame_skip=1)), ["other rewards"]),
+        (lambda f: rewrite(f, lambda a: {**a, "lives": a["lives"][:-1]}), ["lives must be whole numbers (T,)"]),
+        (lambda f: rewrite(f, lambda a: {**a, "lives": np.array("x")}), ["lives must be whole numbers (T,)"]),
     ],
-    ids=["actions", "state", "seeds", "negative", "word", "list", "none", "skip", "frames"],
+    ids=["actions", "state", "seeds", "negative", "word", "list", "none", "skip", "frames", "life", "lives"],
 )
 def test_a_wrong_recording_is_named(damage, words, student, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -780,6 +840,18 @@ def test_no_more_of_the_dqns_play_is_made_into_frames_than_is_learned_from(monke
     monkeypatch.setattr(distill, "watch", lambda game, episode: watched.append(episode))
     episodes = distill.play_teacher(teacher, 1_250, distill.Args(env_id="ALE/Gopher-v5"))
     assert len(episodes) == len(watched) == 13
+
+
+@pytest.mark.parametrize("mode, share", [("greedy", 0.01 * 7 / 8), ("sampled", 0.0)])
+def test_greedy_students_of_gopher_take_a_hundredth_of_random_actions(mode, share, monkeypatch):
+    taken, student = [], distill.Student((6,), 8, 4)
+    with torch.no_grad():
+        student.layers[2].weight.zero_()
+        student.layers[2].bias.copy_(40 * torch.eye(8)[3])
+    obs = np.zeros((40_000, 6), np.float32)
+    monkeypatch.setattr(distill, "play_atari", lambda policy, make_game, seeds: taken.append(policy(obs)) or [])
+    distill.play_student(student, mode, distill.Args(env_id="ALE/Gopher-v5"), [1])
+    assert (taken[0] != 3).mean() == pytest.approx(share, abs=0.002)
 
 
 def test_states_of_the_dqn_itself(pixel_teacher, tmp_path):

@@ -23,6 +23,7 @@ sys.path.append(str(ROOT / "benchmark"))
 import hwm_agreement  # noqa: E402
 import hwm_report  # noqa: E402
 from common import UsageError  # noqa: E402
+from intervals import with_interval  # noqa: E402
 
 SCRIPT = ROOT / "cleanrl_thesis" / "hwm_segment.py"
 FAITHFUL = {  # rung (a) of benchmark/hwm_segment.sh
@@ -31,26 +32,14 @@ FAITHFUL = {  # rung (a) of benchmark/hwm_segment.sh
 }
 SIZES = {"deter_z": 5, "stoch_z": 3, "deter_w": 6, "stoch_w": 2, "hidden_size": 16}
 SMALL = [
-    *(
-        "--train-pairs",
-        300,
-        "--attempts",
-        2,
-        "--total-updates",
-        6,
-        "--checkpoint-interval",
-        2,
-        "--batch-size",
-        4,
-        "--chunk-length",
-        8,
-    ),
+    *("--train-pairs", 300, "--attempts", 2, "--total-updates", 6, "--checkpoint-interval", 2, "--batch-size", 4),
+    *("--chunk-length", 8),
     *(word for name, value in SIZES.items() for word in (f"--{name.replace('_', '-')}", value)),
 ]
 
 
 def search_episode(task: rooms.Maze, steps: np.ndarray, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """A shortest way, with now and then a step aside, in the format of the demonstrations."""
+    """A shortest path, with now and then a step aside, in the format of the demonstrations."""
     pose, goal = task.starts[rng.integers(len(task.starts))]
     poses, actions = [pose], []
     while poses[-1] // 4 != goal:
@@ -66,7 +55,7 @@ def search_episode(task: rooms.Maze, steps: np.ndarray, rng: np.random.Generator
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
-    """60 episodes of shortest ways."""
+    """60 episodes of shortest paths."""
     folder, task, rng = tmp_path_factory.mktemp("demos") / "demos", rooms.maze(11), np.random.default_rng(0)
     steps = rooms.fewest_steps(task)
     episodes = [search_episode(task, steps, rng) for _ in range(60)]
@@ -924,8 +913,8 @@ def test_above_the_floors():
 
 
 def test_interval_of_two_seeds():
-    assert hwm_report.interval([1.0, 2.0]) == "1.50 ± 6.35"  # 12.706 · 0.7071 / √2
-    assert hwm_report.interval([1.0]) == "1.00" and hwm_report.interval([1.0, math.nan]) == ""
+    assert with_interval([1.0, 2.0]) == "1.50 ± 6.35"  # 12.706 · 0.7071 / √2
+    assert with_interval([1.0]) == "1.00" and with_interval([1.0, math.nan]) == ""
 
 
 @pytest.mark.parametrize(
@@ -978,7 +967,7 @@ def test_report_of_agreement(small_run, tmp_path):
         runs=tmp_path / "runs", rung="narrow", size=1, trained=2, first_seed=2, out=tmp_path / "out"
     )
     hwm_agreement.main(args)
-    names = [f"agreement_narrow_1.{ending}" for ending in ("csv", "md", "png")]
+    names = [f"agreement_narrow_1_of_2.{ending}" for ending in ("csv", "md", "png")]
     assert sorted(path.name for path in args.out.iterdir()) == names
     rows = list(csv.DictReader((args.out / names[0]).open()))
     assert [(row["boundaries"], row["seeds"]) for row in rows] == [
@@ -989,3 +978,5 @@ def test_report_of_agreement(small_run, tmp_path):
     assert all(float(rows[0][key]) == measured[key] for key in hwm_agreement.MEASURES)
     with pytest.raises(UsageError, match=r"--runs .* has 1 finished runs narrow_seedN"):
         hwm_agreement.main(replace(args, first_seed=3))
+    with pytest.raises(UsageError, match="--size 3: must be at most --trained 2"):
+        hwm_agreement.main(replace(args, size=3))

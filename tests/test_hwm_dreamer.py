@@ -147,7 +147,7 @@ def test_acting_is_the_inference_of_training_step_by_step():
     model.draw_m(made.q_m, 0.5)
     noise, state = model.noise(6, 3), model.start(3)
     for t in range(6):
-        model.reads = lambda state, action, uniform, t=t: made.reads[t, :, None].detach()
+        model.draw_prior_m = lambda state, action, uniform, t=t: made.reads[t, :, None].detach()
         state, *_ = model.filter(state, one_hot(data.actions[t]), data.first[t, :, None], embed[t], noise[t])
         for part, whole in zip(state, made.belief):
             assert torch.allclose(part, whole[t], atol=1e-5), t
@@ -222,6 +222,58 @@ def test_nothing_leaks_over_the_border_of_an_episode():
     changed.actions[:4] = (changed.actions[:4] + 1) % 3  # the action at its first step is of the episode before
     for before, after in zip(infer(data), infer(changed)):
         assert torch.equal(before[3:], after[3:])
+
+
+@pytest.mark.parametrize("script", ["hwm_dreamer", "hwm_hrl_dreamer"])
+@pytest.mark.parametrize("part", ["action", "c", "v", "h", "y"])
+def test_the_next_state_follows_from_the_action_and_each_part_of_the_one_before(script, part):
+    """c where z is read, from the action, c, v, h and y; h where it is not, from the action, z, h and y (Eq. 3.3.1)."""
+    agent = importlib.import_module(f"cleanrl_thesis.{script}")
+    args = agent.complete_args(agent.Args(**{**TINY, "prefill": 500, "total_timesteps": 1000}))
+    torch.manual_seed(0)
+    model = agent.HWM(args, 3)
+    state, noise = agent.Belief(*(torch.randn(1, size) for size in PARTS), torch.zeros(1, 1)), model.noise(1)
+
+    def after(state, action: int, read: float):
+        made, *_ = model.step(
+            state, one_hot(torch.tensor([action])), torch.full((1, 1), read), torch.zeros(1, 16), noise
+        )
+        return made
+
+    changed = state if part == "action" else state._replace(**{part: getattr(state, part) + 1})
+    action = 2 if part == "action" else 0
+    assert not torch.allclose(after(state, 0, 1.0).c, after(changed, action, 1.0).c)
+    assert not torch.allclose(after(state, 0, 0.0).h, after(changed, action, 0.0).h)
+
+
+@pytest.mark.parametrize("script", ["hwm_dreamer", "hwm_hrl_dreamer"])
+def test_posteriors_know_the_past_and_the_frame(script):
+    """q(v) sees c and the frame, q(y) sees h, z and the frame (Eq. 3.3.2)."""
+    agent = importlib.import_module(f"cleanrl_thesis.{script}")
+    args = agent.complete_args(agent.Args(**{**TINY, "prefill": 500, "total_timesteps": 1000}))
+    torch.manual_seed(0)
+    model, embed = agent.HWM(args, 3), torch.randn(1, 16)
+    state, noise = agent.Belief(*(torch.randn(1, size) for size in PARTS), torch.zeros(1, 1)), model.noise(1)
+
+    def posteriors(state, embed) -> list[torch.Tensor]:
+        return [q.logits for q in model.step(state, torch.zeros(1, 3), torch.zeros(1, 1), embed, noise)[1:]]
+
+    plain = posteriors(state, embed)
+    for part, levels in (("c", (0, 1)), ("v", (1,)), ("h", (1,)), ("embed", (0, 1))):
+        changed = state if part == "embed" else state._replace(**{part: getattr(state, part) + 1})
+        found = posteriors(changed, embed + (part == "embed"))
+        for level in (0, 1):
+            assert torch.allclose(plain[level], found[level]) == (level not in levels), (part, level)
+
+
+def test_boundaries_see_three_steps_to_each_side_within_their_episode():
+    model = make_model(boundary_bound=0.0)
+    embed = torch.randn(15, 1, 16, requires_grad=True)
+    for begin, seen in ((0, range(4, 11)), (6, range(6, 11)), (9, range(4, 9))):
+        first = torch.zeros(15, 1)
+        first[[0, begin]] = 1
+        (gradient,) = torch.autograd.grad(model.posterior_m(embed, first)[7].sum(), embed)
+        assert torch.nonzero(gradient.abs().sum((1, 2))).flatten().tolist() == list(seen)
 
 
 def test_boundaries_see_no_ends_of_chunks():
@@ -342,6 +394,11 @@ def test_loss_is_the_sum_of_its_terms(classes, tanh):
             total -= 5 * torch.log(1 - goes_on if data.terminals[t, b] else goes_on)
     assert loss.item() == pytest.approx(total.item() / 18, rel=1e-4)
     assert all(torch.equal(a, b) for a, b in zip(belief, made.belief))
+    inside, free = 1 - data.first, 1 - made.forced[1:]  # steps with a past; and those that m decided
+    kl_w = method.kl_divergence(made.q_w, model.prior_w(made.belief.h))
+    assert parts["losses/kl_w"].item() == pytest.approx(((kl_w * inside).sum() / inside.sum()).item(), rel=1e-4)
+    agrees = ((made.p_m > 0) == (made.q_m[:-1] > 0)).float()
+    assert parts["losses/agreement"].item() == pytest.approx(((agrees * free).sum() / free.sum()).item())
     settled = (1 - data.first[1:]) * (1 - data.first[:-1])  # steps that neither begin an episode nor come next
     assert parts["losses/read_rate"].item() == pytest.approx(
         (made.reads[1:] * settled).sum().item() / settled.sum().item()
@@ -420,12 +477,13 @@ def test_a_stopped_run_goes_on_to_the_same_bytes(small_run, tmp_path):
 
 
 def test_kinds_of_steps_and_ages():
-    """One game: two walks in room 0, a turn, a bump, into a door and out of it; reads at steps 0, 2 and 5."""
-    rooms, poses = np.array([[0, 0, 0, 0, 0, 4, 1]]).T, 4 * np.array([[0, 1, 2, 2, 2, 9, 12]]).T
+    """One game: two walks in room 0, a turn, a bump, into a door, a turn there and out of it; reads at steps 0, 2 and 5."""
+    rooms, poses = np.array([[0, 0, 0, 0, 0, 4, 4, 1]]).T, 4 * np.array([[0, 1, 2, 2, 2, 9, 9, 12]]).T
     poses[3:] += 1
+    poses[6:] += 1
     kinds = dreamer_reads.kinds_of_steps(rooms, poses)
     steps = {name: np.flatnonzero(mask).tolist() for name, mask in kinds.items()}
-    assert list(steps.values()) == [[1], [5], [6], [2], [3], [4]]
+    assert list(steps.values()) == [[1], [5], [7], [2], [3], [6], [4]]
     assert dreamer_reads.ages(np.array([[1, 0, 1, 0, 0, 1, 0]], bool).T).T.tolist() == [[0, 1, 2, 1, 2, 3, 1]]
 
 

@@ -279,6 +279,18 @@ def test_the_player_acts_by_its_skill():
     assert np.array_equal(actions, player.skill.argmax(1)) and np.bincount(actions).min() > 100
 
 
+def test_greedy_takes_the_best_skill_and_the_best_action():
+    learner = make_agent(num_skills=3)
+    learner.behaviour.high_policy = lambda features: torch.tensor([0.1, 0.2, 0.0]).expand(len(features), 3)
+    learner.behaviour.policy = lambda features, skill: torch.tensor([0.3, 0.0, 0.1]).expand(len(features), 3)
+    player = method.Player(learner, 200)
+    side = learner.args.frame_side
+    player.observe(np.zeros((200, side, side, 3), np.uint8), np.ones(200, bool))
+    actions = player.act(greedy=True)
+    assert (player.skill.argmax(1) == 1).all() and (actions == 0).all()
+    assert len(set(player.act().tolist())) == 3 == len(set(player.skill.argmax(1).tolist()))
+
+
 def test_the_player_keeps_its_skill_until_z_is_read(tmp_path):
     args = make_args(num_skills=4, fixed_interval=5)
     torch.manual_seed(0)

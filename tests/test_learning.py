@@ -60,6 +60,6 @@ def test_gail_drives_like_the_synthetic_human(tmp_path):
 
 
 def test_ppo_finds_its_way_through_four_rooms(tmp_path):
-    """Return of the last 500 episodes of training; random play gets 0.024, the shortest ways 0.900."""
+    """Return of the last 500 episodes of training; random play gets 0.024, the shortest paths 0.900."""
     run("--stop-at", 500_000, "--eval-episodes", 20, "--run-dir", "run", cwd=tmp_path, script=ROOMS)
     assert json.loads((tmp_path / "run" / "result.json").read_text())["training"]["mean"] > 0.4

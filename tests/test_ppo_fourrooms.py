@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT, assert_refused, kill_twice, needs_compiler, run
+from test_fourrooms import brute_force_steps
 
 from cleanrl_thesis import ppo_fourrooms as method
 
@@ -290,6 +291,29 @@ def test_a_folder_of_another_run_is_refused(small_run, tmp_path):
     words = ["--seed 2 (was 1)", "must be as in"]
     done = run(*SMALL, "--run-dir", small_run, "--resume", "--seed", 2, cwd=tmp_path, code=2, script=SCRIPT)
     assert all(word in done.stderr for word in words) and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("mode", ["greedy", "sampled"])
+def test_play_draws_or_takes_the_best(mode):
+    args, agent = small_args(), method.Agent(22, 3, 4, 16)
+    with torch.no_grad():
+        agent.actor.weight.zero_()
+        agent.actor.bias.copy_(torch.tensor([0.2, 0.5, 0.3]).log())
+    actions = np.concatenate([episode["actions"] for episode in method.play(agent, args, list(range(200)), mode)])
+    shares = np.bincount(actions, minlength=3) / len(actions)
+    assert np.allclose(shares, [0, 1, 0] if mode == "greedy" else [0.2, 0.5, 0.3], atol=0.02)
+
+
+def test_the_optimal_return_is_that_of_shortest_ways(tmp_path, monkeypatch):
+    """By breadth-first search from the starts of the episodes that were played."""
+    args, maze = small_args(eval_episodes=40), method.maze(11)
+    agent, played, play = method.Agent(args.frame_side, 3, 4, 16), [], method.play
+    monkeypatch.setattr(method, "play", lambda *its: played.extend(found := play(*its)) or found)
+    evaluation = method.evaluate(agent, args, tmp_path)
+    starts = [episode["states"][0].tolist() for episode in played]
+    steps = [brute_force_steps(maze, 4 * cell + direction, goal) for cell, direction, goal in starts]
+    assert len(steps) == 40 and evaluation["optimal"] == pytest.approx(np.mean([1 - 0.9 * n / 100 for n in steps]))
+    assert evaluation["solved"] == np.mean([episode["rewards"].sum() > 0 for episode in played])
 
 
 def test_parameters_that_explode_end_the_run(tmp_path):

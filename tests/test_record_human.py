@@ -260,7 +260,7 @@ def test_practice_and_what_is_broken_off_is_not_kept(at_once, tmp_path, monkeypa
 
 @pytest.mark.parametrize("drawn, kept", [(range(0, 1900, 8), True), (range(0, 600, 8), False), ([], False)])
 def test_a_round_that_nobody_sees_is_not_kept(drawn, kept, tmp_path, monkeypatch):
-    """Pictures are drawn to the end, for ten seconds or never: a second of 60 pictures later the round is over."""
+    """Pictures are drawn to the end, for ten seconds or never: 30 pictures, half a second, later the round is over."""
     monkeypatch.setattr(record, "COUNTDOWN", 0)
     browser = Browser(make_args(folder=tmp_path / "anna"))
 
@@ -274,7 +274,7 @@ def test_a_round_that_nobody_sees_is_not_kept(drawn, kept, tmp_path, monkeypatch
     monkeypatch.setattr(record.Clock, "tick", tick)
     player = record.Player(types.SimpleNamespace(send_bytes=send, send_json=send))
     episode = asyncio.run(record.play_episode(browser.game, player, 1))
-    assert (episode is not None) == kept and player.sent == (1801 if kept else max(drawn, default=0) + 61)
+    assert isinstance(episode, dict) == kept and player.sent == (1801 if kept else max(drawn, default=0) + 31)
 
 
 def test_only_practice(at_once, tmp_path, monkeypatch):
@@ -365,6 +365,53 @@ def test_recordings_go_on_where_they_stopped(tmp_path, monkeypatch):
     ]
 
 
+def test_rounds_that_are_not_kept_are_counted(at_once, tmp_path):
+    """Those that were to be recorded: a score tells more beside them."""
+    args = make_args(folder=tmp_path / "anna")
+    browser = Browser(args)
+    with browser.connect() as socket:
+        browser.play(socket, "record", stop_after=5)
+        browser.play(socket, "practice", stop_after=5)
+        browser.play(socket, "record")
+        browser.play(socket, "record", stop_after=5)
+    assert json.loads((args.out / "manifest.json").read_text())["rounds_not_kept"] == 2
+    again = record.Recordings.open(args.out, record.about_recordings(args, browser.game))
+    assert again.lost == 2 and len(again.files) == 1
+
+
+@pytest.mark.parametrize("slowness, kept", [(1.05, True), (1.2, False)])
+def test_a_round_that_was_too_slow_is_not_kept(slowness, kept, at_once, tmp_path, monkeypatch):
+    """The clock of the machine goes faster than the game's: who plays has more time."""
+    frames = itertools.count()
+    monkeypatch.setattr(record.time, "perf_counter_ns", lambda: int(next(frames) * slowness * 1e9 / 60))
+    browser = Browser(make_args(folder=tmp_path / "anna"))
+    with browser.connect() as socket:
+        told = browser.play(socket, "record")
+    assert told["recorded"] == kept and told.get("trouble") == (None if kept else record.SLOW)
+    assert len(list(tmp_path.glob("anna/*.npz"))) == kept
+
+
+def test_a_key_pressed_and_let_go_between_two_frames_acts_for_one():
+    player = record.Player(None)
+    for held in (["fire"], [], ["left"]):
+        player.understand({"held": held, "axes": [0, 0], "seq": 1})
+    assert player.take_keys().held == {"fire", "left"} and player.take_keys().held == {"left"}
+    player.understand({"held": [], "axes": [0, 0], "seq": 2})
+    assert player.take_keys().held == set()
+
+
+def test_keys_of_before_a_round_do_not_act_in_it(at_once, tmp_path):
+    browser = Browser(make_args(folder=tmp_path / "anna"))
+    with browser.connect() as socket:
+        for held in (["right"], []):
+            socket.send_json({"held": held, "axes": [0, 0], "seq": 1})
+        browser.until(socket, "ready")
+        socket.send_json({"order": "record"})
+        browser.until(socket, "over")
+    with np.load(tmp_path / "anna" / "episode_00000.npz") as arrays:
+        assert (arrays["actions"] == 4).all()
+
+
 def test_a_disk_that_is_full_loses_no_round_that_is_kept(at_once, tmp_path, monkeypatch):
     """The episode cannot be written, then it can, and only the manifest cannot."""
     full, write = ["episode"], record.write_whole
@@ -391,6 +438,29 @@ def test_a_folder_that_is_added_to_gets_other_rounds(at_once, tmp_path):
             browser.play(socket, "record")
     seeds = [int(np.load(path)["seed"]) for path in sorted((tmp_path / "anna").glob("*.npz"))]
     assert len(seeds) == 2 and seeds[0] != seeds[1]
+
+
+def test_practice_shows_no_round_that_is_recorded(at_once, tmp_path, monkeypatch):
+    played, play_episode = [], record.play_episode
+    monkeypatch.setattr(
+        record, "play_episode", lambda game, player, seed: played.append(seed) or play_episode(game, player, seed)
+    )
+    for given in ({"practice": True}, {}):
+        browser = Browser(make_args(folder=tmp_path / "anna", **given))
+        with browser.connect() as socket:
+            browser.play(socket, "practice" if given else "record", stop_after=3)
+    assert len(set(played)) == 2
+
+
+def test_recordings_of_another_emulator_are_not_added_to(tmp_path, monkeypatch, capsys):
+    """Their manifest names one version; it is refused before anything is written."""
+    monkeypatch.setattr(record, "serve", lambda *_: None)
+    (tmp_path / "anna").mkdir()
+    about = record.about_recordings(args := make_args("ALE/Gopher-v5", tmp_path / "anna"), record.make_game(args))
+    record.write_json(args.out / "manifest.json", {"version": 1, **about, "ale_py": "0.0.1", "files": {}})
+    flags = ["--env-id", args.env_id, "--player", "anna", "--out", args.out, "--port", 0]
+    assert_refused(record, capsys, flags, ["--out", "was recorded with ale-py 0.0.1", about["ale_py"]])
+    assert json.loads((args.out / "manifest.json").read_text())["ale_py"] == "0.0.1"
 
 
 @pytest.mark.parametrize(
@@ -509,7 +579,10 @@ def test_frames_of_gopher_go_to_minari_without_loss(at_once, tmp_path, monkeypat
         (["--player", "anna", "--host", "300.1.1.1"], ["--host", "300.1.1.1"]),
         (["--player", "anna", "--out", "/proc/nowhere", "--port", 0], ["--out", "/proc/nowhere", "cannot be written"]),
         (["--player", "anna", "--seed", -1], ["--seed", "-1"]),
-        (["--player", "anna", "--verify", "--export-minari", "a-v0"], ["--verify", "--export-minari", "alone"]),
+        (
+            ["--player", "anna", "--verify", "--export-minari", "a-v0"],
+            ["--verify", "--export-minari", "exclude each other"],
+        ),
         (["--player", "anna", "--export-minari", "anna"], ["--export-minari", "anna", "apple/anna-v0"]),
         (["--player", "anna", "--verify"], ["--out", "recordings/anna", "no recordings"]),
         (["--player", "anna", "--no-such-flag"], ["--no-such-flag"]),

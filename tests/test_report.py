@@ -198,7 +198,8 @@ def test_a_claim_that_is_wrong_is_contradicted_and_one_seed_says_by_what(rows):
     assert report.tell("80 near 10", "", report.minus, worse, better, margin=1.0).verdict == "confirmed"
     single = {task: values[:1] for task, values in worse.items()}
     finding = report.tell("80 above 10", "", report.minus, single, better)
-    assert finding.verdict == "contradicted, by tasks" and finding.measured.endswith("2 tasks, 1 to 2 seeds")
+    assert finding.verdict == "contradicted, over tasks" and finding.measured.endswith("2 tasks, 1 to 2 seeds")
+    assert "[" not in finding.measured and finding.over_tasks.startswith("[-")
     alone = {"Hopper-v2": single["Hopper-v2"]}
     finding = report.tell("80 above 10", "", report.minus, alone, better)
     assert (
@@ -323,6 +324,28 @@ def test_cost_by_runs_that_were_timed_alone(study, tmp_path):
         assert [float(row["seconds_per_step"]) for row in csv.DictReader(file)] == pytest.approx([1e-4, 8e-4])
 
 
+def test_cost_of_no_finished_run_is_refused_and_nothing_is_lost(study, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "cost.csv").write_text("kept")
+    with pytest.raises(UsageError, match="--cost .*: holds no finished run"):
+        report.main(report.Args(runs=study, steps=102_400, out=tmp_path / "out", cost=tmp_path / "no", workers=1))
+    assert [path.read_text() for path in (tmp_path / "out").iterdir()] == ["kept"]
+
+
+def test_bands_of_a_profile_are_between_scores_that_were_reached():
+    """With two seeds each, no draw is above the greatest score or below the least."""
+    rows = [
+        {"task": task, "method": "PPO", "d_target": "", "K": 10, "seed": seed, "ner": 0.5 + 0.2 * seed}
+        for task in ("a", "b")
+        for seed in (0, 1)
+    ]
+    axes = report.profiles(rows, "ner").axes[0]
+    (line,), (band,) = axes.lines, axes.collections
+    ends = band.get_paths()[0].vertices
+    assert line.get_ydata()[50] == 1 and line.get_ydata()[71] == 0 and line.get_ydata()[60] == 0.5
+    assert (ends[ends[:, 0] < 0.495][:, 1] == 1).sum() > 50 and (ends[ends[:, 0] > 0.705][:, 1] == 0).sum() > 50
+
+
 def test_a_setting_without_all_tasks_is_compared_with_none(rows):
     """KLE-Stop 0.05 at K = 80 on one task of two: not in the interquartile means; of one seed there is no interval."""
     part = [row for row in rows if (row["K"], row["d_target"], row["task"]) != (80, 0.05, "Hopper-v2")]
@@ -370,6 +393,19 @@ def test_runs_whose_folders_are_gone_count_on(study, tmp_path):
     assert f"{number - 3} of the runs are those of an earlier report" in (tmp_path / "out" / "tables.md").read_text()
 
 
+def test_runs_that_went_on_count_without_their_folders(study, tmp_path):
+    """They had no result yet: neither a speed nor the script's checksum."""
+    shutil.copytree(study, tmp_path / "runs")
+    for path in (tmp_path / "runs").glob("*/result.json"):
+        path.unlink()
+    report.main(report.Args(runs=tmp_path / "runs", steps=102_400, out=tmp_path / "out", workers=1))
+    shutil.rmtree(tmp_path / "runs")
+    again = report.Args(runs=tmp_path / "runs", steps=102_400, out=tmp_path / "out", known=tmp_path / "out", workers=1)
+    before = (tmp_path / "out" / "runs.csv").read_text()
+    report.main(again)
+    assert (tmp_path / "out" / "runs.csv").read_text() == before
+
+
 def test_an_earlier_report_without_curves(study, tmp_path):
     report.main(report.Args(runs=study, steps=102_400, out=tmp_path / "out", workers=1))
     (tmp_path / "out" / "curves.npz").unlink()
@@ -388,6 +424,15 @@ def test_a_single_task_leaves_a_claim_open():
     """Seeds of one task say nothing of others."""
     found = report.tell("", "", report.minus, {"Hopper": np.array([1.0, 0.9])}, {"Hopper": np.array([0.5, 0.4])})
     assert (found.measured, found.verdict) == ("+0.50, 1 task, 2 seeds", "open")
+
+
+def test_a_claim_that_holds_in_these_tasks_and_not_in_every_one_tells_both():
+    """Seeds are alike, tasks are not: 1 and -0.5."""
+    ours = {"a": np.array([1.0, 1.01]), "b": np.array([0.0, 0.01])}
+    theirs = {"a": np.array([0.0, 0.01]), "b": np.array([0.5, 0.51])}
+    found = report.tell("", "", report.minus, ours, theirs)
+    assert found.verdict == "confirmed; over tasks open"
+    assert found.measured.startswith("+0.25 [+0.2") and found.over_tasks.startswith("[-")
 
 
 @pytest.mark.parametrize("setting, stages", [("printed", set()), ("modern", {"--kle-rollback", "--update-epochs 80"})])

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from conftest import SMALL, assert_same_run, command, kill_twice, run
+from conftest import SCRIPT, SMALL, assert_same_run, command, kill_twice, run
 
 HOPPER = [
     *("--env-id", "kle/Hopper-v2", "--total-timesteps", "10240", "--num-steps", "512", "--update-epochs", "4"),
@@ -185,6 +185,17 @@ def test_killed_while_the_folder_was_made(small_run, tmp_path):
     (tmp_path / "run" / "args.json.tmp").write_text("{")
     run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path)
     assert_same_run(small_run, tmp_path / "run")
+
+
+def test_a_changed_script_is_said(tmp_path):
+    copy = Path(shutil.copy(SCRIPT, tmp_path))
+    run(*SMALL, "--run-dir", "run", "--stop-at", 1280, cwd=tmp_path, script=copy)
+    done = run(*SMALL, "--run-dir", "run", "--resume", "--stop-at", 1536, cwd=tmp_path, script=copy)
+    assert "script has changed" not in done.stderr
+    with open(copy, "a") as file:
+        file.write("\n")
+    done = run(*SMALL, "--run-dir", "run", "--resume", cwd=tmp_path, script=copy)
+    assert "--resume: this script has changed" in done.stderr
 
 
 def test_another_machines_episode_is_said(small_run, tmp_path, monkeypatch):

@@ -87,23 +87,35 @@ def rows(db: Path, query: str) -> list[tuple]:
 # ---------------------------------------------------------------------------------------------------------------------
 # Clips
 # ---------------------------------------------------------------------------------------------------------------------
-def test_windows_do_not_overlap_and_come_from_many_episodes():
-    rng = np.random.default_rng(0)
+def test_clips_of_all_agents_begin_at_the_same_moments_of_other_episodes():
+    """None overlaps another, or goes beyond its episode; an episode has two only where there is no other."""
+    rng, found = np.random.default_rng(0), 0
     for _ in range(200):
-        lengths = {Path(str(i)): int(rng.integers(1, 500)) for i in range(rng.integers(1, 6))}
-        frames, clips = int(rng.integers(20, 200)), int(rng.integers(1, 8))
-        windows = study.choose_windows(lengths, frames, clips, rng)
-        possible = sum(length // frames for length in lengths.values())
-        assert len(windows) == min(clips, possible)
-        for path, start in windows:
-            assert 0 <= start <= lengths[path] - frames
-        for (path, start), (other, other_start) in itertools.combinations(windows, 2):
-            assert path != other or abs(start - other_start) >= frames
-        long_enough = sum(length >= frames for length in lengths.values())
-        assert len({path for path, _ in windows}) == min(len(windows), long_enough)
-    episodes = {Path(str(i)): 1_800 for i in range(200)}
-    starts = [start for _, start in study.choose_windows(episodes, 900, 200, rng)]
+        lengths = {
+            name: {Path(f"{name}{i}"): int(rng.integers(100, 900)) for i in range(rng.integers(2, 9))} for name in "ab"
+        }
+        frames, clips = int(rng.integers(20, 200)), int(rng.integers(1, 6))
+        cuts = study.common_windows(lengths, frames, clips, rng)
+        found += cuts is not None
+        for name, windows in (cuts or {}).items():
+            assert len(windows) == clips and [start for _, start in windows] == [start for _, start in cuts["a"]]
+            assert all(0 <= start <= lengths[name][path] - frames for path, start in windows)
+            for (path, start), (other, other_start) in itertools.combinations(windows, 2):
+                assert path != other or abs(start - other_start) >= frames
+    assert found > 150
+    assert study.common_windows({"a": {Path("a"): 99}, "b": {Path("b"): 500}}, 100, 1, rng) is None
+
+
+def test_moments_of_clips_are_even_and_tell_no_agent():
+    """An agent that often ends early has as many late clips as the other; its long episodes are drawn for them."""
+    rng = np.random.default_rng(0)
+    lengths = {"a": {Path(f"a{i}"): 1_800 for i in range(16)}}
+    lengths["b"] = {Path(f"b{i}"): 1_800 if i < 12 else 1_000 for i in range(16)}
+    cuts = [study.common_windows(lengths, 900, 4, rng) for _ in range(100)]
+    starts = [start for cut in cuts for _, start in cut["b"]]
     assert scipy.stats.kstest(starts, "uniform", (0, 900)).pvalue > 0.001
+    early = [start for cut in cuts for path, start in cut["b"] if int(path.name[1:]) >= 12]
+    assert 0 < len(early) < len(starts) / 4 and max(early) <= 100
 
 
 def test_clips_have_the_length_asked_for_and_hold_nothing_else(drawn_clips):
@@ -280,7 +292,7 @@ def test_driving_is_drawn(tmp_path):
         (["anna"], ["--prepare", "NAME=FOLDER"]),
         (["a=damaged"], ["episode_00000.npz", "SHA-256"]),
         (["a=unfinished"], ["unfinished", "not done"]),
-        (["a=anna", "--export", "results"], ["--prepare", "--export", "alone"]),
+        (["a=anna", "--export", "results"], ["--prepare", "--export", "exclude each other"]),
     ],
 )
 def test_what_cannot_be_cut_is_refused_and_leaves_nothing(flags, words, tmp_path, monkeypatch, capsys):
@@ -310,6 +322,20 @@ def test_everyone_sees_two_clips_of_each_agent_in_an_order_of_their_own(videos):
     counts = [sum(clip == other for _, _, other, _ in seen) for clip in {clip for _, _, clip, _ in seen}]
     assert len(counts) == 9 and max(counts) - min(counts) <= 1  # those that were seen least come first
     assert len({address for *_, address in seen}) == 180
+
+
+def test_clips_with_the_fewest_answers_come_first(videos):
+    """Whoever leaves without an answer takes nothing from a clip."""
+    client, db = open_study(videos)
+    for number in range(30):
+        client.post("/join", json={"key": key_of(number)})
+    chosen = {agent: clip for clip, agent in rows(db, "SELECT clip, agent FROM clips")}
+    with contextlib.closing(sqlite3.connect(db)) as base, base:
+        base.execute("UPDATE trials SET verdict = 'human'")
+        base.executemany("UPDATE trials SET verdict = NULL WHERE clip = ?", [(clip,) for clip in chosen.values()])
+    client.post("/join", json={"key": key_of(99)})
+    drawn = {clip for (clip,) in rows(db, "SELECT clip FROM trials WHERE participant = 31")}
+    assert set(chosen.values()) < drawn
 
 
 def test_nothing_that_is_sent_tells_the_agent(videos):
@@ -398,7 +424,7 @@ def test_the_study_goes_on_with_its_clips(videos, capsys):
     assert client.post("/next", json={"key": key_of(1)}).json() == {"done": True, "total": 6}
     assert rows(db, "SELECT COUNT(*) FROM clips") == [(10,)]
     study.write_clip(videos / "human" / "000.mp4", pictures(78), 12)
-    assert_refused(study, capsys, ["--videos", videos, "--db", db, "--port", 0], ["--videos", "has changed ones"])
+    assert_refused(study, capsys, ["--videos", videos, "--db", db, "--port", 0], ["--videos", "have changed"])
     (videos.parent / "text").write_text("no database")
     flags = ["--videos", videos, "--db", videos.parent / "text", "--port", 0]
     assert_refused(study, capsys, flags, ["--db", "not a database"])
@@ -420,7 +446,8 @@ def test_a_clip_that_is_gone_is_asked_for_again(videos, capsys):
         path.rename(path.with_suffix(".away"))
     answer = client.get(f"/clip/{address}")
     assert (answer.status_code, answer.json()) == (503, {"detail": "cannot be read"})
-    assert "No such file" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "No such file" in err and not any(agent in err for agent in AGENTS)  # whoever leads the study reads it
     for path in videos.glob("*/*.away"):
         path.rename(path.with_suffix(".mp4"))
     assert client.get(f"/clip/{address}").status_code == 200
@@ -502,6 +529,27 @@ def test_export_counts_as_by_hand(videos, tmp_path, capsys):
     assert float(table["human"]["high"]) == 1 and "0 of" in capsys.readouterr().out
 
 
+def test_what_is_exported_names_nobody(videos, tmp_path):
+    """Participants are numbered in another order than they came, and ages stand in a file of their own, in another order too."""
+    client, db = open_study(videos)
+    for number in range(20):
+        take_part(client, number, lambda position: "human")
+    ages = [str(20 + number) for number in range(20)]
+    orders = []
+    for folder in ("one", "two"):
+        assert study.cli(["--db", str(db), "--export", str(tmp_path / folder)]) == 0
+        with open(tmp_path / folder / "participants.csv", newline="") as file:
+            orders.append([row["age"] for row in csv.DictReader(file)])
+        with open(tmp_path / folder / "comments.csv", newline="") as file:
+            written = list(csv.DictReader(file))
+        assert sorted({int(row["participant"]) for row in written}) == list(range(1, 21)) and len(written) == 120
+        own = rows(db, "SELECT file, agent FROM trials JOIN clips USING (clip) WHERE participant = 1 ORDER BY position")
+        seen = {n: [(r["clip"], r["agent"]) for r in written if int(r["participant"]) == n] for n in range(1, 21)}
+        orders.append([n for n in seen if seen[n] == own])
+    assert sorted(orders[0]) == sorted(orders[2]) == ages and orders[0] != ages and orders[0] != orders[2]
+    assert all(len(order) >= 1 for order in orders[1::2])
+
+
 def test_comments_stay_text_and_no_formula(videos, tmp_path):
     comments = [
         '=HYPERLINK("http://evil.example";"x")',
@@ -520,7 +568,9 @@ def test_comments_stay_text_and_no_formula(videos, tmp_path):
     assert study.cli(["--db", str(db), "--export", str(tmp_path)]) == 0
     assert study.cli(["--db", str(db), "--export", str(db / "results")]) == 2  # no folder can be in a file
     with open(tmp_path / "comments.csv", newline="") as file:
-        found = [row["comment"] for row in csv.DictReader(file)]
+        comment_rows = list(csv.DictReader(file))
+    found = [row["comment"] for row in comment_rows]
+    assert list(comment_rows[0]) == ["participant", "agent", "verdict", "position", "clip", "comment"]
     assert found == [
         "'" + comments[0],
         "'" + comments[1],

@@ -61,6 +61,25 @@ def test_runs_are_the_product_of_environments_variants_grid_and_seeds():
     assert runs[0].name == "kle_A-v2__update-epochs=4__lr=1e-3__seed3" and runs[0].setting() == runs[1].setting()
 
 
+def test_runs_of_a_setting_share_their_time():
+    names = {
+        "hrl_seed2": "hrl",
+        "Hopper-v2__seed1": "",
+        "kle_A-v2__update-epochs=4__lr=1__seed12": "update-epochs=4__lr=1",
+    }
+    assert {name: sweep.Run(name, ()).setting() for name in names} == names
+
+
+@pytest.mark.parametrize("words, stop", [(["--stop-at", "12"], 12), (["--stop_at=7"], 7), (["--stop"], None)])
+def test_a_stop_of_a_run_s_own_in_every_spelling(words, stop):
+    run = sweep.Run("a", ("python", "x.py", *words))
+    args = sweep.Args(stop_at=9)
+    assert run.stop_at() == stop and len(sweep.command_of(args, run)) == len(run.command) + 2 * (stop is None)
+    for step in (6, 8, 10, 12):
+        result = {"complete": False, "global_step": step}
+        assert sweep.is_done(args, run, result) == (step >= (stop or 9))
+
+
 def test_another_manifest_of_the_same_name_is_refused(tmp_path):
     run(SMALL, tmp_path)
     before = (tmp_path / "runs" / "sweep.jsonl").read_bytes()
@@ -143,7 +162,7 @@ def test_failed_runs_are_listed_with_their_last_words(tmp_path):
 def test_a_command_that_cannot_work_is_told_after_the_first(flags, words, tries, tmp_path):
     """Two workers: the first run ends the sweep once its tries are used up, however many are waiting."""
     _, err = run([*SMALL, "--num-seeds", "200", *flags], tmp_path, code=1)
-    assert words in err and "sent again" in err
+    assert words in err and "run the same command again" in err
     logs = list((tmp_path / "runs" / "logs").iterdir())
     starts = [path.read_text().count("$ ") for path in logs if "A-v0__" in path.name and "seed1.log" in path.name]
     assert len(logs) <= 5 and (tries is None or tries in starts)
@@ -175,7 +194,7 @@ def test_ctrl_c_lets_runs_write_their_checkpoints(tmp_path):
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=20)
-    assert process.returncode == 130 and "sent again, the sweep goes on" in err
+    assert process.returncode == 130 and "run the same command again to continue" in err
     before = records(tmp_path)
     assert len(before) == 2 and all(text.count("\n") < 300 for text in before.values())
     run(flags, tmp_path)
@@ -275,7 +294,7 @@ def test_a_full_disk_stops_the_sweep_and_loses_nothing(tmp_path):
     log.parent.mkdir(parents=True)
     log.symlink_to("/dev/full")
     _, err = run([*SMALL, "--workers", "1"], tmp_path, code=1)
-    assert "A-v0__bonus=5__seed1 could not be started: [Errno 28] No space left" in err and "goes on" in err
+    assert "A-v0__bonus=5__seed1 could not be started: [Errno 28] No space left" in err and "to continue" in err
     assert ends(tmp_path) == [1, 1]
     log.unlink()
     run([*SMALL, "--workers", "1"], tmp_path)
@@ -297,6 +316,10 @@ def test_a_full_disk_stops_the_sweep_and_loses_nothing(tmp_path):
         (["--workers", "0"], "--workers 0"),
         (["--stop-at", "0"], "--stop-at 0"),
         (["--name", "a b"], "--name a b"),
+        (["--slurm-memory", "2 G"], "--slurm-memory 2 G: must be a number"),
+        (["--name", ""], "--name : must be letters"),
+        (["--command", "python 'x.py"], "--command python 'x.py: No closing quotation"),
+        (["--grid", "stop-at=5,x"], "A-v0__stop-at=x__seed1: --stop-at x: must be a number of steps"),
         (["--slurm-template-path", "no/such"], "--slurm-template-path no/such: no such file"),
         (["--only", "3"], "runs/sweep.jsonl: no readable manifest"),
         (["--runs", TOY], "toy_run.py: must be a folder"),
@@ -348,25 +371,30 @@ def test_a_first_run_that_fails_late_stops_no_others(tmp_path):
         assert state.failed == {runs[0]: 1} and bool(state.stopped) == stops
 
 
+def stand_ins(folder: Path, monkeypatch) -> None:
+    """Put stand-ins for squeue and sbatch first on the path; beside them they keep what they are given."""
+    keep = (
+        f'echo "$@" >> {folder.parent}/calls_of_sbatch; for last; do :; done; cat "$last" >> {folder.parent}/submitted'
+    )
+    folder.mkdir()
+    for name, body in (("squeue", ""), ("sbatch", f"{keep}; echo 77")):
+        (folder / name).write_text(f"#!/bin/sh\n{body}\n")
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+
+
 def test_arrays_are_submitted_in_chunks_of_what_is_not_done(tmp_path, monkeypatch):
-    """With stand-ins for squeue and sbatch, which keep what they are given."""
-    for name, body in (
-        ("squeue", ""),
-        ("sbatch", 'echo "$@" >> calls; for last; do :; done; cat "$last" >> submitted; echo 77'),
-    ):
-        (tmp_path / "bin").mkdir(exist_ok=True)
-        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{body}\n")
-        (tmp_path / "bin" / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    stand_ins(tmp_path / "bin", monkeypatch)
     run([*SMALL, "--num-seeds", "1"], tmp_path)
     flags = [*SMALL, "--name", "more", "--num-seeds", "3", "--slurm-chunk", "5", "--stop-at", "9", "--workers", "4"]
+    flags += ["--slurm-memory", "3G"]
     out, _ = run([*flags, "--slurm-template-path", ROOT / "benchmark" / "slurm_template.sh"], tmp_path)
     assert re.findall(r"^(\d+) runs in job 77", out, re.M) == ["5", "3"]
     text = (tmp_path / "submitted").read_text()
     assert "{{" not in text and re.findall(r"--array=(\S+)", text) == ["0-4%4", "0-2%4"]
     assert re.findall(r"^lines=\((.*)\)", text, re.M) == ["4 5 6 7 8", "9 10 11"]
-    assert "--runs runs --name more --stop-at 9 --only" in text
-    calls = (tmp_path / "calls").read_text().splitlines()
+    assert "--runs runs --name more --stop-at 9 --only" in text and text.count("#SBATCH --mem=3G\n") == 2
+    calls = (tmp_path / "calls_of_sbatch").read_text().splitlines()
     assert "--dependency" not in calls[0] and "--dependency=afterany:77" in calls[1]
     (tmp_path / "bin" / "squeue").write_text("#!/bin/sh\necho 77\n")
     for more in ([], ["--grid", "bonus=7"]):
@@ -470,6 +498,20 @@ def test_a_failed_expert_keeps_its_own_students_alone(script, failed, settings, 
     calls = [json.loads(line) for line in (tmp_path / "calls").read_text().splitlines()]
     runs = {" ".join(words) for words in calls if words[0].startswith("cleanrl_thesis/")}
     assert error.value.returncode == 1 and calls[-1][0] == f"benchmark/{report}" and len(runs) == number
+
+
+@pytest.mark.parametrize("script", ["gopher_ram.sh", "torcs_alpha.sh"])
+def test_a_study_whose_runs_were_queued_waits_for_them(script, tmp_path, monkeypatch):
+    """Nothing that needs the runs is begun; once they are there, the same command makes the report."""
+    stand_ins(tmp_path / "bin", monkeypatch)
+    settings = {"SLURM": "benchmark/slurm_template.sh"}
+    with pytest.raises(FileNotFoundError):  # no method and no report was called
+        study(script, tmp_path, **settings)
+    if script == "gopher_ram.sh":
+        for seed in (1, 2, 3):
+            (tmp_path / "runs" / f"seed{seed}").mkdir()
+            (tmp_path / "runs" / f"seed{seed}" / "result.json").write_text('{"complete": true}')
+        assert study(script, tmp_path, **settings)[-1][0] == "benchmark/gopher_ram.py"
 
 
 def test_a_study_runs_in_a_folder_with_a_blank(tmp_path):
