@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The Apple game: a teacher for each seed, students over α and T, other states and splits, and students of a human who is
 # nearer to the DQN ("quick"); the runs behind benchmark/results/apple/.
-# Can be sent again after every stop. Two runs at a time: about 3 hours on 2 cores.
+# After an interruption, run the same command again. Two runs at a time: about 3 hours on 2 cores.
 #   benchmark/apple_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/apple_alpha.sh
 #   WORKERS=50 SLURM=benchmark/slurm_template.sh benchmark/apple_alpha.sh     on a cluster; again when the teachers are done, and for the report
@@ -10,12 +10,12 @@ cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/apple}
 ALPHAS=${ALPHAS:-0.93 1.0 0.0 0.5 0.8 0.9 0.7 0.6 0.4 0.3 0.2 0.1}
 OTHER_ALPHAS=${OTHER_ALPHAS:-0.93 1.0 0.5 0.7 0.8 0.3 0.9}
-. benchmark/sweep_lines.sh  # sweep
+. benchmark/sweep_lines.sh  # sweep, end_unless_done
 mkdir -p "$RUNS"
 for seed in $SEEDS; do
   echo "teacher_seed$seed --seed $seed"
 done | sweep teachers cleanrl_thesis/dqn_apple.py --compile --save-model || code=$?
-[ "$code" -le 1 ] || exit "$code"
+end_unless_done
 ready= missing=
 for seed in $SEEDS; do
   if [ -e "$RUNS/teacher_seed$seed/result.json" ]; then ready="$ready $seed"; else missing="$missing $RUNS/teacher_seed$seed"; fi
@@ -55,6 +55,6 @@ student() {  # seed, α, name, more flags
     done
   done
 } | sweep students cleanrl_thesis/distill_hybrid.py --compile --save-model || code=$?
-[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
+end_unless_done
 "$PYTHON" benchmark/apple_report.py --runs "$RUNS"
 exit "$code"

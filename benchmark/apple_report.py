@@ -3,7 +3,7 @@
     python benchmark/apple_report.py        # runs/apple -> benchmark/results/apple
 
 Takes whatever part of the runs of `benchmark/apple_alpha.sh` is done, and says which. Intervals are 95% t-intervals of
-the seeds' means; each mean is over 400 episodes.
+the seeds' means.
 """
 
 import itertools
@@ -21,7 +21,22 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F
 from apple_players import QUICK, load_method, shortest_path
-from common import ROOT, UsageError, commit, commit_of, finished_runs, published_table, run_main, write_csv
+from common import (
+    ROOT,
+    UsageError,
+    commit,
+    distinct,
+    finished_runs,
+    kind_of,
+    made_at,
+    published_table,
+    read_args,
+    run_folders,
+    run_main,
+    select,
+    write_csv,
+)
+from intervals import interval, paired_difference, with_interval
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -50,7 +65,7 @@ def read_runs(folder: Path) -> list[dict]:
     """One row for every finished run: what it was and what it scored."""
     rows = []
     for run, result in finished_runs(folder):
-        args, kind = json.loads((run / "args.json").read_text()), re.sub(r"_seed\d+$", "", run.name)
+        args, kind = read_args(run), kind_of(run)
         is_student = "sampled" in result["evaluation"]
         evaluations = result["evaluation"] if is_student else {"greedy": result["evaluation"]}
         for mode, numbers in evaluations.items():
@@ -61,6 +76,7 @@ def read_runs(folder: Path) -> list[dict]:
                     "alpha": args.get("alpha", ""),
                     "temperature": args.get("temperature", ""),
                     "mode": mode,
+                    "episodes": numbers["episodes"],
                     **{name: round(numbers[name], 3) for name in ("mean", "std", "min", "max")},
                     "kept_epoch": result["test"]["epoch"] if is_student else "",
                     "test_accuracy_rl": round(result.get("test", {}).get("accuracy_rl") or np.nan, 4),
@@ -71,24 +87,6 @@ def read_runs(folder: Path) -> list[dict]:
                 }
             )
     return rows
-
-
-def select(rows: list[dict], kind: str, mode: str) -> list[dict]:
-    return [row for row in rows if row["kind"] == kind and row["mode"] == mode]
-
-
-def interval(values: list[float]) -> tuple[float, float]:
-    """Mean and half width of its 95% t-interval; nan of a single value."""
-    if len(values) < 2:
-        return float(np.mean(values)) if values else np.nan, np.nan
-    return float(np.mean(values)), float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
-
-
-def with_interval(values: list[float], digits: int = 2) -> str:
-    mean, half = interval(values)
-    if np.isnan(mean):
-        return ""
-    return f"{mean:.{digits}f}" + ("" if np.isnan(half) else f" ± {half:.{digits}f}")
 
 
 def scripted_rows(method, player, seeds: list[int]) -> list[dict]:
@@ -175,12 +173,6 @@ def alpha_table(rows: list[dict], mode: str) -> str:
         cells = [cell(curve.get(alpha, {}), most) for curve in columns.values()]
         lines.append(f"| {alpha} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
-
-
-def paired_difference(first: dict[int, float], second: dict[int, float]) -> str:
-    """Difference of the scores of the seeds that both have, with its interval."""
-    difference, half = interval([first[seed] - second[seed] for seed in first.keys() & second.keys()])
-    return "" if np.isnan(difference) else f"{difference:+.1f}" + ("" if np.isnan(half) else f" ± {half:.1f}")
 
 
 def shape_table(rows: list[dict], humans: dict[str, float]) -> str:
@@ -273,9 +265,7 @@ def figure_2_4(rows: list[dict], humans: dict[str, float]) -> Figure:
     for axes in grid[-1]:
         axes.set_xlabel("α, weight of the DQN")
     figure.legend(*grid[0, 1].get_legend_handles_labels(), fontsize="small", loc="outside right center")
-    figure.suptitle(
-        f"Fig. 2.4: mean score of 400 episodes over α; bands are 95% intervals of {most} seeds, thin lines have fewer"
-    )
+    figure.suptitle(f"Fig. 2.4: mean score over α; bands are 95% intervals of {most} seeds, thin lines have fewer")
     return figure
 
 
@@ -303,9 +293,10 @@ def agents_of(method, folder: Path, seed: int, episodes: int) -> dict[str, list[
     if (folder / f"teacher_seed{seed}" / "result.json").exists():
         teacher = method.load_teacher(folder / f"teacher_seed{seed}", "AppleGame-v0")
         policies["DQN"] = method.numpy_greedy(teacher)
+    runs = run_folders(folder)
     for alpha in ("0.0", "0.5", "0.8", "0.93", "1.0"):
-        run = folder / f"alpha{alpha}_seed{seed}"
-        if (run / "result.json").exists():
+        run = runs.get((f"alpha{alpha}", seed))
+        if run is not None:
             student = load_student(method, run)
             for mode in ("sampled", "greedy"):
                 policies[f"α = {alpha}, {mode}"] = method.numpy_policy(student, mode, seed)
@@ -410,12 +401,10 @@ def provenance(rows: list[dict], seeds: list[int]) -> str:
     """What the results rest on."""
     count = len({(row["kind"], row["seed"]) for row in rows})
     hours = sum(row["training_seconds"] for row in rows if row["mode"] == "greedy") / 3600
-    scripts = {"dqn_apple": "teacher", "distill_hybrid": "alpha"}
-    digests = {s: {row["script_sha256"] for row in rows if part in row["kind"]} for s, part in scripts.items()}
-    made_at = [f"{s}.py at {', '.join(sorted(commit_of(s, d) for d in digests[s]))}" for s in scripts]
+    scripts = {"dqn_apple": ("teacher",), "distill_hybrid": ("alpha",)}
     return (
-        f"`benchmark/apple_alpha.sh`, commits: {'; '.join(made_at)}; this report at {commit()}. {count} runs, "
-        f"{hours:.1f} core-hours of training, seeds {', '.join(map(str, seeds))}; each mean is over 400 episodes, each ± "
+        f"`benchmark/apple_alpha.sh`, commits: {made_at(rows, scripts)}; this report at {commit()}. {count} runs, "
+        f"{hours:.1f} core-hours of training, seeds {', '.join(map(str, seeds))}; each mean is over {distinct(rows, 'episodes')} episodes, each ± "
         "is a 95% t-interval over seeds. A student is of the epoch with the best test accuracy where no other is named."
         "\n\n"
     )
@@ -430,10 +419,10 @@ def main(args: Args) -> None:
     seeds = sorted({row["seed"] for row in rows})
     quick_human = type("QuickHuman", (method.SyntheticHuman,), QUICK)
     human = scripted_rows(method, lambda seed: method.SyntheticHuman(400, seed), seeds)
-    quick = scripted_rows(method, lambda seed: quick_human(400, seed), seeds)
     shortest = scripted_rows(method, lambda seed: shortest_path(method), seeds)
     humans = {"": float(np.mean([row["mean"] for row in human]))}
     if any(row["kind"].startswith("quick_") for row in rows):
+        quick = scripted_rows(method, lambda seed: quick_human(400, seed), seeds)
         humans["quick_"] = float(np.mean([row["mean"] for row in quick]))
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(args.out / "runs.csv", rows)

@@ -1,10 +1,11 @@
-"""What the benchmarks share: how they start, published tables, results as CSV, and the commits that results rest on."""
+"""What the benchmarks share: how they start, published tables, runs, results as CSV, and the commits that results rest on."""
 
 import contextlib
 import csv
 import hashlib
 import io
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -34,15 +35,16 @@ def parse_args(arguments: type, doc: str):
 
 
 def check_counts(args) -> None:
-    """Raise UsageError where a whole number is less than 1, or a seed less than 0."""
+    """Raise UsageError where a whole number, or one of several, is less than 1, or a seed less than 0."""
     for name, value in vars(args).items():
         least = 0 if name.endswith("seed") else 1
-        if isinstance(value, int) and value < least:
-            raise UsageError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
+        values = value if isinstance(value, tuple) else (value,)
+        if any(type(each) is int and each < least for each in values):  # a flag is no number
+            raise UsageError(f"--{name.replace('_', '-')} {' '.join(map(str, values))}: must be at least {least}")
 
 
 def run_main(main: Callable, arguments: type, doc: str) -> None:
-    """Run `main` with what the command line says; a wrong value is one line and exit code 2."""
+    """Run `main` with what the command line says; a wrong value is one line and exit code 2, a file in the way exit code 1."""
     try:
         args = parse_args(arguments, doc)
         check_counts(args)
@@ -50,12 +52,20 @@ def run_main(main: Callable, arguments: type, doc: str) -> None:
     except UsageError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except OSError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file by its columns."""
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def published_rows(name: str) -> list[dict[str, str]]:
     """A published table."""
-    with open(ROOT / "benchmark" / "published" / name, newline="") as file:
-        return list(csv.DictReader(file))
+    return read_csv(ROOT / "benchmark" / "published" / name)
 
 
 def published_table(name: str) -> dict[str, dict[str, str]]:
@@ -71,12 +81,40 @@ def finished_runs(folder: Path) -> Iterator[tuple[Path, dict]]:
             yield path.parent, result
 
 
+def read_args(run: Path) -> dict:
+    """The arguments of a run."""
+    return json.loads((run / "args.json").read_text())
+
+
+def kind_of(run: Path) -> str:
+    """The name of a run's folder without its seed; α as Python writes the number, whether the folder has 0, 0.0 or 0.00."""
+    return re.sub(r"alpha[\d.]+$", f"alpha{read_args(run).get('alpha')}", re.sub(r"_seed\d+$", "", run.name))
+
+
+def run_folders(folder: Path) -> dict[tuple[str, int], Path]:
+    """The folders of finished runs by kind and seed."""
+    return {(kind_of(run), result["seed"]): run for run, result in finished_runs(folder)}
+
+
+def distinct(rows: list[dict], column: str) -> str:
+    """The numbers in a column, each once."""
+    return " or ".join(f"{number:,}" for number in sorted({row[column] for row in rows}))
+
+
 def write_csv(path: Path, rows: list[dict]) -> None:
-    """Write rows that have the same columns."""
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    """Write rows that have the same columns, all or nothing."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    draft = path.with_name(path.name + ".tmp")
+    draft.write_text(text.getvalue())
+    draft.replace(path)
+
+
+def select(rows: list[dict], kind: str, mode: str) -> list[dict]:
+    """The rows of one kind of run and one way to act."""
+    return [row for row in rows if row["kind"] == kind and row["mode"] == mode]
 
 
 def git(*words: str) -> str:
@@ -95,3 +133,13 @@ def commit_of(script: str, digest: str) -> str:
     commits = git("log", "--format=%h", "--", path).split()
     found = (c for c in commits if hashlib.sha256(git("show", f"{c}:{path}").encode()).hexdigest().startswith(digest))
     return next(found, "not recorded")
+
+
+def made_at(rows: list[dict], scripts: dict[str, tuple[str, ...]]) -> str:
+    """The commits of the scripts that made the rows, each of those whose kind holds one of its words."""
+    found = []
+    for script, words in scripts.items():
+        digests = {row["script_sha256"] for row in rows if any(word in row["kind"] for word in words)}
+        if digests:
+            found.append(f"{script}.py at {', '.join(sorted(commit_of(script, digest) for digest in digests))}")
+    return "; ".join(found)

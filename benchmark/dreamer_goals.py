@@ -7,15 +7,15 @@ the goal's cell: cells, episodes, share of the goals reached, and mean return. A
 """
 
 import importlib
-import json
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
-from common import UsageError, run_main
+from common import UsageError, read_args, run_main
 
+DREAMERS = ("dreamer_v2", "hwm_dreamer", "hwm_hrl_dreamer")
 GROUPS = {"0": (0, 0), "1 to 2": (1, 2), "3 to 9": (3, 9), "10 and more": (10, 10**9)}  # rewards at a goal's cell
 
 
@@ -29,11 +29,12 @@ class Args:
 
 def load(run: Path) -> tuple:
     """Script, arguments, agent and replay of a run. Raises UsageError where there is no checkpoint."""
-    saved = torch.load(run / "checkpoint.pt", weights_only=True) if (run / "checkpoint.pt").exists() else None
-    if saved is None:
+    path = run / "checkpoint.pt"
+    saved = torch.load(path, map_location="cpu", weights_only=True) if path.exists() else {}
+    if saved.get("format", "").split(" ")[0] not in DREAMERS:
         raise UsageError(f"{run}: holds no checkpoint of a Dreamer")
-    arguments = json.loads((run / "args.json").read_text())
-    method = importlib.import_module(f"cleanrl_thesis.{arguments['exp_name']}")
+    arguments = read_args(run)
+    method = importlib.import_module(f"cleanrl_thesis.{saved['format'].split(' ')[0]}")
     names = {field.name for field in fields(method.Args)} - {"run_dir", "resume"}
     args = method.Args(**{name: value for name, value in arguments.items() if name in names})
     model = (method.WorldModel if hasattr(method, "WorldModel") else method.HWM)(args, int(method.ROOM_ACTIONS.n))

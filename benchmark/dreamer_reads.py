@@ -56,6 +56,7 @@ def kinds_of_steps(rooms: np.ndarray, poses: np.ndarray) -> dict[str, np.ndarray
         "leaves a door": later & in_room & ~stays,
         "in a room, walks": later & in_room & stays & ~turns & ~bumps,
         "in a room, turns": later & in_room & stays & turns,
+        "in a door, turns": later & ~in_room & stays & turns,
         "walks against a wall": later & stays & bumps,
     }
 

@@ -8,7 +8,6 @@ from the first update, after the random play of `--prefill`, whose episodes are 
 mean of its last 200 episodes is as high; near 0.5 these span some 10,000 steps. Intervals are 95% t-intervals over seeds.
 """
 
-import csv
 import json
 import re
 import zipfile
@@ -17,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import ROOT, UsageError, commit, commit_of, run_main, write_csv
+from common import ROOT, UsageError, commit, commit_of, read_args, read_csv, run_main, write_csv
+from intervals import with_interval
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -76,7 +76,7 @@ def learned_episodes(folder: Path, prefill: int) -> tuple[np.ndarray, np.ndarray
 
 def has_curve(folder: Path) -> bool:
     """Whether as many episodes have ended since the first update as the first mean is of."""
-    prefill = json.loads((folder / "args.json").read_text())["prefill"]
+    prefill = read_args(folder)["prefill"]
     return len(learned_episodes(folder, prefill)[0]) >= LEAST
 
 
@@ -85,7 +85,7 @@ def read_run(folder: Path) -> dict:
 
     The comparison's columns stand where the run has made one, those of the end where it has ended.
     """
-    args = json.loads((folder / "args.json").read_text())
+    args = read_args(folder)
     steps, returns = learned_episodes(folder, args["prefill"])
     means = moving_mean(returns)
     row = {"agent": re.sub(r"_seed\d+$", "", folder.name), "seed": args["seed"], "size": args["size"]}
@@ -116,8 +116,7 @@ def cell(text: str) -> float | int | str:
 def read_known(folder: Path) -> list[dict]:
     """The runs of an earlier report as `read_runs` gives them. Raises UsageError where it cannot be read."""
     try:
-        with open(folder / "runs.csv", newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = read_csv(folder / "runs.csv")
         curves = np.load(folder / "curves.npz")
         words = {"agent", "size", "env_id", "script_sha256"}
         rows = [{key: text if key in words else cell(text) for key, text in row.items()} for row in rows]
@@ -148,15 +147,6 @@ def read_runs(folder: Path, known: list[dict] = ()) -> list[dict]:
     return runs
 
 
-def interval(values: list[float], digits: int) -> str:
-    """Mean and the half-width of its 95% t-interval."""
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return f"{mean:,.{digits}f}"
-    half = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / len(values) ** 0.5
-    return f"{mean:,.{digits}f} ± {half:,.{digits}f}"
-
-
 def has_ended(row: dict) -> bool:
     return not np.isnan(row["greedy"])
 
@@ -173,10 +163,10 @@ def table(rows: list[dict]) -> list[str]:
         for level in LEVELS:
             known = [row[f"steps_to_{level}"] for row in group if not np.isnan(row[f"steps_to_{level}"])]
             some = f" ({len(known)} of {len(group)})" if 0 < len(known) < len(group) else ""
-            cells.append(interval(known, 0) + some if known else "not reached")
-        cells += [interval([row[name] for row in group], 3) for name in ("last_200", "greedy")]
+            cells.append(with_interval(known, 0) + some if known else "not reached")
+        cells += [with_interval([row[name] for row in group], 3) for name in ("last_200", "greedy")]
         gaps = [row["dreamed_return"] - row["real_return"] for row in group if not np.isnan(row["dreamed_return"])]
-        cells.append(interval(gaps, 3) if gaps else "")
+        cells.append(with_interval(gaps, 3) if gaps else "")
         cells.append(f"{np.mean([row['training_seconds'] / 60 for row in group]):.0f}")
         lines.append(f"| {title} | {len(group)} | {' | '.join(cells)} |")
     return lines
@@ -202,10 +192,10 @@ def needs_table(runs: list[dict], stages: tuple[int, ...] = STAGES) -> list[str]
         reached = [run["row"]["steps_to_0.5"] for run in group if not np.isnan(run["row"]["steps_to_0.5"])]
         some = f" ({len(reached)} of {len(group)})" if 0 < len(reached) < len(group) else ""
         cells = [f"{min(run['row']['steps'] for run in group):,}"]
-        cells.append(interval(reached, 0) + some if reached else "not reached")
+        cells.append(with_interval(reached, 0) + some if reached else "not reached")
         for stage in stages:
             values = [mean_at(run, stage) for run in group]
-            cells.append("" if np.isnan(values).any() else interval(values, 3))
+            cells.append("" if np.isnan(values).any() else with_interval(values, 3))
         lines.append(f"| {'as it is' if agent == 'dreamer' else title} | {len(group)} | {' | '.join(cells)} |")
     return lines
 

@@ -10,7 +10,7 @@ or neither, so that whatever π^L is to know of the goal has to come through the
 can do is said by `Tables`, two levels made by hand, whose returns stand first.
 
 Prints, and writes as `benchmark/results/dreamer/skills.md`, the mean return of the greedy policies from all starts of the maze after
-each sixth of the updates (shortest ways: 0.899), and in the end: that return with skills drawn evenly instead of by π^H; what a skill
+each sixth of the updates (shortest paths: 0.899), and in the end: that return with skills drawn evenly instead of by π^H; what a skill
 of π^H says of z, I(e; z); and what a skill that is drawn evenly says of the action, I(e; a | w, z), both in nats, over all starts, whose
 goal is in another room.
 Networks, rates and returns are those of `hwm_hrl_dreamer.py --size xs`, the features and the skill eight times as large.
@@ -120,7 +120,7 @@ def true_returns(behaviour: hrl.Behaviour, model: Segments, draws_skills: bool =
 
 
 def ways(moves: np.ndarray, inside: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """First actions of the shortest ways to cells `ends` that stay in cells `inside` before, for each pose, (P,)."""
+    """First actions of the shortest paths to cells `ends` that stay in cells `inside` before, for each pose, (P,)."""
     cell = np.arange(len(moves)) // 4
     steps = np.where(np.isin(cell, ends), 0.0, np.inf)
     allowed = np.isin(cell, inside) | np.isin(cell, ends)

@@ -4,7 +4,7 @@
     python benchmark/dreamer_true.py --starts 128 64 32 --horizons 15 10
 
 Prints, and writes as `benchmark/results/dreamer/true_dynamics.md`, the mean return of the greedy policy from all starts of
-the maze after each sixth of the updates; the shortest ways have 0.899. Everything else is as `dreamer_v2.py --size xs` has it.
+the maze after each sixth of the updates; the shortest paths have 0.899. Everything else is as `dreamer_v2.py --size xs` has it.
 """
 
 import time

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Dreamer, HWM Dreamer and HWM HRL Dreamer in FourRooms, and both HWM agents with segments of a fixed length; and dreamer_*, the
-# baseline without one of the things that it needs: the runs behind benchmark/results/dreamer/. Can be sent again after every stop.
+# baseline without one of the things that it needs: the runs behind benchmark/results/dreamer/. After an interruption, run the same command again.
 #   benchmark/fourrooms.sh
 #   STEPS=1100000 SEEDS="1 2" AGENTS="dreamer hwm" WORKERS=2 benchmark/fourrooms.sh     the first 1,100,000 steps
 #   STEPS=1060000 SEEDS=1 AGENTS="dreamer_sharp dreamer_slow dreamer_early dreamer_far dreamer_uniform dreamer_eps" benchmark/fourrooms.sh
-#   SIZE=thesis FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh
+#   SIZE=thesis FLAGS="--cuda --compile" WORKERS=1 benchmark/fourrooms.sh     on Slurm with a template of your own that asks for a GPU
 #   WORKERS=20 SLURM=benchmark/slurm_template.sh benchmark/fourrooms.sh     on a cluster; again for the report
 #   KNOWN=benchmark/results/dreamer/xs benchmark/fourrooms.sh    the report goes on from an earlier one whose run folders are gone
 set -euo pipefail
@@ -12,7 +12,7 @@ cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4} AGENTS=${AGENTS:-dreamer hwm hrl hwm_fixed hrl_fixed} SIZE=${SIZE:-xs} ENV_ID=${ENV_ID:-FourRooms11-v0}
 WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/dreamer_$SIZE} FLAGS=${FLAGS---compile}
 INTERVAL=${INTERVAL:-4}
-. benchmark/sweep_lines.sh  # sweep
+. benchmark/sweep_lines.sh  # sweep, end_unless_done
 script() {  # AGENT: its file and its own flags
   case $1 in
     dreamer) echo dreamer_v2.py ;;
@@ -45,6 +45,6 @@ for seed in $SEEDS; do
       $own $FLAGS
   done
 done | sweep agents || code=$?
-[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
+end_unless_done
 "$PYTHON" benchmark/dreamer_report.py --runs "$RUNS" ${KNOWN:+--known "$KNOWN"}
 exit "$code"

@@ -5,21 +5,19 @@
 A hierarchical world model that reads the state where a region ends pays for each read (its budget or price), and for what the
 state at a read tells that the one before did not: the entropy of the pose with which a region is entered, given the pose at the
 read before, the goal and the policy. Both are computed here from the maze and a policy, for regions bounded by lines parallel
-to the walls, for the rooms, and for a read every k steps. The policy takes one of the shortest ways, each tie drawn, and with
+to the walls, for the rooms, and for a read every k steps. The policy takes one of the shortest paths, each tie drawn, and with
 probability `noise` any action instead.
 """
 
-import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import ROOT, commit, run_main
+from common import ROOT, UsageError, commit, run_main
 
-sys.path.insert(0, str(ROOT))
-from cleanrl_thesis import ppo_fourrooms as rooms  # noqa: E402
+from cleanrl_thesis import ppo_fourrooms as rooms
 
 END = -1  # the goal, where no read follows
 Distribution = dict[int, float]  # over poses, or END
@@ -109,6 +107,8 @@ def segmentations(maze: rooms.Maze) -> dict[str, Callable]:
 
 
 def main(args: Args) -> None:
+    if not all(0 <= noise <= 1 for noise in args.noises):
+        raise UsageError(f"--noises {' '.join(map(str, args.noises))}: must be between 0 and 1")
     maze = rooms.maze(11)
     starts = maze.starts[np.random.default_rng(1).integers(len(maze.starts), size=args.episodes)]
     lines = [f"`python benchmark/fourrooms_cuts.py --episodes {args.episodes}` at {commit()}.", ""]

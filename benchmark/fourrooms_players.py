@@ -1,4 +1,4 @@
-"""PPO in FourRooms: runs -> one table of their returns beside the shortest ways from the same starts.
+"""PPO in FourRooms: runs -> one table of their returns beside the shortest paths from the same starts.
 
 for seed in 1 2 3; do
   python cleanrl_thesis/ppo_fourrooms.py --bf16 --seed $seed --save-model --run-dir runs/fourrooms/11_seed$seed --resume
@@ -12,7 +12,7 @@ python benchmark/fourrooms_players.py        # runs/fourrooms -> benchmark/resul
 from dataclasses import dataclass
 from pathlib import Path
 
-from common import ROOT, UsageError, commit, commit_of, finished_runs, run_main, write_csv
+from common import ROOT, UsageError, commit, commit_of, distinct, finished_runs, run_main, write_csv
 
 
 @dataclass
@@ -30,6 +30,7 @@ def read_runs(folder: Path) -> list[dict]:
         greedy = result["evaluation"]
         row = {"env_id": result["env_id"], "seed": result["seed"], "steps": result["global_step"]}
         row |= {"minutes": round(result["training_seconds"] / 60, 1), "sampled": result["training"]["mean"]}
+        row |= {"sampled_episodes": result["training"]["episodes"], "greedy_episodes": greedy["episodes"]}
         row |= {"greedy": greedy["mean"], "optimal": greedy["optimal"], "solved": greedy["solved"]}
         rows.append({**row, "commit": commit_of("ppo_fourrooms", result["script_sha256"])})
     return rows
@@ -37,10 +38,10 @@ def read_runs(folder: Path) -> list[dict]:
 
 def table(rows: list[dict]) -> str:
     """The rows as Markdown, the greedy return as a share of the optimal one beside it."""
-    lines = [
-        "| task | seed | steps | minutes | sampled, last 500 | greedy, 2,000 | shortest ways | share | solved | commit |"
-    ]
-    lines.append("|" + "---|" * 10)
+    sampled, greedy = (distinct(rows, f"{mode}_episodes") for mode in ("sampled", "greedy"))
+    heads = ["task", "seed", "steps", "minutes", f"sampled, last {sampled}", f"greedy, {greedy}"]
+    heads += ["shortest paths", "share", "solved", "commit"]
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for row in rows:
         share = row["greedy"] / row["optimal"]
         sampled = "" if row["sampled"] is None else f"{row['sampled']:.3f}"  # no episode came to its end

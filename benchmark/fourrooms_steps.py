@@ -12,7 +12,7 @@ import gymnasium as gym
 import minigrid.wrappers
 import tyro
 from common import UsageError, run_main
-from sb3_timing import report
+from timing import report
 
 import cleanrl_thesis.ppo_fourrooms  # noqa: F401, registers the mazes
 

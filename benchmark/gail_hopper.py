@@ -3,7 +3,7 @@
     python benchmark/gail_hopper.py                # 3 seeds: 1,000,000 steps of PPO and 2,000,000 of GAIL each
     python benchmark/gail_hopper.py --seeds 1
 
-Can be sent again after every stop. Writes `benchmark/results/gail_hopper/{runs.csv,table.md}`.
+After an interruption, run the same command again. Writes `benchmark/results/gail_hopper/{runs.csv,table.md}`.
 """
 
 import json
@@ -13,8 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from apple_report import with_interval
 from common import ROOT, commit, commit_of, run_main, write_csv
+from intervals import with_interval
 
 
 @dataclass

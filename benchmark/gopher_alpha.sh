@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Gopher: a teacher from 10,010,000 frames of pixels, and students of it and of the synthetic human over α, and over T at
-# two α, with controls; the runs behind benchmark/results/gopher/. Can be sent again after every stop. The teacher takes about 3
+# two α, with controls; the runs behind benchmark/results/gopher/. After an interruption, run the same command again. The teacher takes about 3
 # hours of a core with bfloat16, 4 without (benchmark/results/speed/gopher.md), 7 of two cores without AVX-512; its replay 8 GB.
 #   benchmark/gopher_alpha.sh
 #   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
@@ -14,11 +14,12 @@ OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1} TEACHER=${TEACHER-$RU
 ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
 TEMPERATURES=${TEMPERATURES-0.1 0} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0}
 CONTROL_SEEDS=${CONTROL_SEEDS-${SEEDS%% *}}
-. benchmark/sweep_lines.sh  # sweep
+SLURM_MEMORY=${SLURM_MEMORY:-6G}  # a student holds 1.6 GB of frames, for a moment twice
+. benchmark/sweep_lines.sh  # sweep, end_unless_done
 mkdir -p "$RUNS"
 if [ -n "$TEACHER" ]; then
   # lives end episodes as in Baselines; targets of three steps stand for its prioritised replay; the rate falls, for the last network
-  # is the teacher. Two threads only where nothing runs beside: those that wait spin, and would be held up by what does.
+  # is the teacher. Two threads only on an otherwise idle machine: waiting threads spin, and competing processes slow the run down.
   "$PYTHON" cleanrl_thesis/dqn_gopher.py --life-loss-ends --n-step 3 --anneal-lr --bf16 \
     --num-threads "$THREADS" --save-model --eval-episodes 400 --run-dir "$TEACHER" --resume
 fi
@@ -47,7 +48,7 @@ student() {  # seed, α, name, more flags
     done
   done
 } | sweep students cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --compile --save-model || code=$?
-[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
+end_unless_done
 "$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT" ${NOTE:+--note "$NOTE"}
 "$PYTHON" benchmark/gopher_likeness.py --runs "$RUNS" --out "$OUT"
 exit "$code"

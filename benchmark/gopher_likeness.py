@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from apple_report import load_student, median, tell_apart, with_interval
-from common import ROOT, UsageError, commit, finished_runs, run_main, write_csv
+from apple_report import load_student, median, tell_apart
+from common import ROOT, UsageError, commit, finished_runs, run_folders, run_main, write_csv
 from gopher_players import ENV_ID, load_method
+from intervals import with_interval
 
 UP_FIRE = 5
 FPS, CLIP = 15, 30  # actions a second, and in a clip of 2 s
@@ -65,15 +66,19 @@ def agents_of(method, folder: Path, seed: int, games: int) -> dict[str, list[dic
     if (folder / "teacher_seed1" / "result.json").exists():
         teacher = method.greedy_policy(method.load_teacher(folder / "teacher_seed1", ENV_ID), torch.device("cpu"))
         played["DQN"] = method.play_atari(cautious(teacher), make_game, seeds)
+    runs = run_folders(folder)
     for alpha in ALPHAS:
-        run = folder / f"alpha{alpha}_seed{seed}"
-        if (run / "result.json").exists():
+        run = runs.get((f"alpha{alpha}", seed))
+        if run is not None:
             student = load_student(method, run, space, num_actions)
             greedy, sampled = (method.numpy_policy(student, mode, seed) for mode in ("greedy", "sampled"))
             played[f"α = {alpha}, sampled"] = method.play_atari(sampled, make_game, seeds)
             played[f"α = {alpha}, greedy"] = method.play_atari(cautious(greedy), make_game, seeds)
     game = in_memory()
-    return {name: [{**each, "memory": watch_memory(game, each)} for each in games] for name, games in played.items()}
+    return {
+        name: [{**episode, "memory": watch_memory(game, episode)} for episode in episodes]
+        for name, episodes in played.items()
+    }
 
 
 def watch_memory(game, episode: dict[str, np.ndarray]) -> np.ndarray:

@@ -5,15 +5,16 @@
 The interval is a 95% t-interval over seeds. Random play is of `benchmark/results/gopher/players.csv`.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from apple_report import with_interval
-from common import ROOT, UsageError, commit, commit_of, finished_runs, run_main, write_csv
+from common import ROOT, UsageError, commit, commit_of, distinct, finished_runs, read_csv, run_main, write_csv
 from gopher_report import WINDOW, teacher_curve
+from intervals import with_interval
 from matplotlib.figure import Figure
+
+GAMES = ("training", "evaluation")
 
 
 @dataclass
@@ -26,9 +27,8 @@ class Args:
 
 def random_score() -> float:
     """The mean points of a game of random play."""
-    with open(ROOT / "benchmark" / "results" / "gopher" / "players.csv", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["player"] == "random" and row["unit"] == "points of a game"]
-    return float(rows[0]["mean"])
+    rows = read_csv(ROOT / "benchmark" / "results" / "gopher" / "players.csv")
+    return next(float(row["mean"]) for row in rows if row["player"] == "random" and row["unit"] == "points of a game")
 
 
 def row_of(run: Path, result: dict) -> dict:
@@ -38,7 +38,7 @@ def row_of(run: Path, result: dict) -> dict:
         "frames": result["global_step"],
         "minutes": round(result["training_seconds"] / 60, 1),
     }
-    for name in ("training", "evaluation"):
+    for name in GAMES:
         row |= {f"{name}_{key}": round(result[name][key], 1) for key in ("episodes", "mean", "std")}
     row["rewards_of_a_life"] = round(result["evaluation"]["rewards_per_life"]["mean"], 2)
     return row | {"script_sha256": result["script_sha256"][:12]}
@@ -46,8 +46,9 @@ def row_of(run: Path, result: dict) -> dict:
 
 def table(rows: list[dict], random: float) -> str:
     """A line for each seed, and one for all."""
+    games = {name: distinct(rows, f"{name}_episodes") for name in GAMES}
     lines = [
-        "| seed | frames | minutes | last 50 games of training | 100 games, ε = 0.01 | of random play's | rewards of a life |"
+        f"| seed | frames | minutes | last {games['training']} games of training | {games['evaluation']} games of evaluation | of random play's | rewards of a life |"
     ]
     lines.append("|" + "---|" * 7)
     for row in rows:

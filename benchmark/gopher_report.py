@@ -8,26 +8,27 @@ t-intervals of the seeds' means. A seed has its own human and student, but all s
 the error of its own score.
 """
 
-import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from apple_report import (
-    ACTS,
-    alpha_curve,
-    cell,
-    interval,
-    mean_score,
-    representative_alpha,
+from apple_report import ACTS, alpha_curve, cell, mean_score, representative_alpha, temperatures
+from common import (
+    ROOT,
+    UsageError,
+    commit,
+    finished_runs,
+    kind_of,
+    made_at,
+    published_table,
+    read_args,
+    run_main,
     select,
-    temperatures,
-    with_interval,
+    write_csv,
 )
-from common import ROOT, UsageError, commit, commit_of, finished_runs, published_table, run_main, write_csv
 from gopher_players import Args as PlayersArgs
 from gopher_players import load_method, measure, quick_human
+from intervals import interval, with_interval
 from matplotlib.figure import Figure
 
 LIVES, GAMES = "rewards of a life", "points of a game"
@@ -49,20 +50,15 @@ class Args:
     """folder for tables and figures"""
 
 
-def kind_of(name: str, args: dict) -> str:
-    """A run's name without its seed; α as a number is written, whether the folder's is 0, 0.0 or 0.00."""
-    return re.sub(r"alpha[\d.]+$", f"alpha{args.get('alpha')}", re.sub(r"_seed\d+$", "", name))
-
-
 def read_runs(folder: Path) -> list[dict]:
     """A row for every finished run, way to act and unit: what it was and what it scored."""
     rows = []
     for run, result in finished_runs(folder):
-        args, is_student = json.loads((run / "args.json").read_text()), "sampled" in result["evaluation"]
+        args, is_student = read_args(run), "sampled" in result["evaluation"]
         evaluations = result["evaluation"] if is_student else {"greedy": result["evaluation"]}
         for mode, numbers in evaluations.items():
             for unit, scores in ((LIVES, numbers["rewards_per_life"]), (GAMES, numbers)):
-                row = {"kind": kind_of(run.name, args), "seed": result["seed"]}
+                row = {"kind": kind_of(run), "seed": result["seed"]}
                 row |= {"alpha": args.get("alpha", ""), "temperature": args.get("temperature", "")}
                 row |= {"mode": mode, "unit": unit, "scores": scores["episodes"]}
                 row |= {name: round(scores[name], 3) for name in ("mean", "std", "min", "max")}
@@ -285,7 +281,7 @@ def teacher_flags(runs: Path) -> str:
     """In what the teachers differ from the defaults of dqn_gopher.py, which are the thesis'."""
     flags = set()
     for run, _ in finished_runs(runs):
-        args = json.loads((run / "args.json").read_text())
+        args = read_args(run)
         if run.name.startswith("teacher"):
             named = [("--life-loss-ends", args["life_loss_ends"]), (f"--n-step {args['n_step']}", args["n_step"] > 1)]
             flags.add(" ".join(flag for flag, holds in (*named, ("--anneal-lr", args["anneal_lr"])) if holds))
@@ -297,11 +293,9 @@ def provenance(rows: list[dict], runs_folder: Path, note: str) -> str:
     runs = {(row["kind"], row["seed"]): row for row in rows}
     hours = sum(row["training_seconds"] * row["threads"] for row in runs.values()) / 3600
     arithmetic = " and ".join(sorted({row["arithmetic"].split(" on ")[0].split(", ")[-1] for row in runs.values()}))
-    scripts = {"dqn_gopher": "teacher", "distill_hybrid": "alpha"}
-    digests = {s: {row["script_sha256"] for row in rows if part in row["kind"]} for s, part in scripts.items()}
-    made_at = [f"{s}.py at {', '.join(sorted(commit_of(s, d) for d in digests[s]))}" for s in scripts if digests[s]]
+    scripts = {"dqn_gopher": ("teacher",), "distill_hybrid": ("alpha",)}
     return (
-        f"`benchmark/gopher_alpha.sh`, commits: {'; '.join(made_at)}; this report at {commit()}. {len(runs)} runs, "
+        f"`benchmark/gopher_alpha.sh`, commits: {made_at(rows, scripts)}; this report at {commit()}. {len(runs)} runs, "
         f"{hours:.1f} core-hours of training, in {arithmetic}; each ± is a 95% t-interval over seeds. All students learn from "
         "the same DQN, another of which would be other; differences from it hold the error of its own score. "
         f"{teacher_flags(runs_folder)}A student learns at T = 0.01 where no other is named, and is of the epoch with the best test "

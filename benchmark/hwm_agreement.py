@@ -16,22 +16,20 @@ The vote (`hwm_segment.agree`) was chosen on seeds 1 to 8 of rung (e), `--size` 
 the tables are of other seeds, and have none in common. `hwm_segment.py --attempts 3` trains and measures one committee.
 """
 
-import csv
 import json
 import re
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import safetensors.torch
 import torch
-from common import ROOT, UsageError, commit, commit_of, finished_runs, run_main, write_csv
-from hwm_report import FLOORS, IGNORANT, above_floors, best_floors, interval
+from common import ROOT, UsageError, commit, commit_of, finished_runs, read_args, read_csv, run_main, write_csv
+from hwm_report import FLOORS, IGNORANT, above_floors, best_floors
+from intervals import with_interval
 from matplotlib.figure import Figure
 
-sys.path.insert(0, str(ROOT))
-from cleanrl_thesis import hwm_segment as hwm  # noqa: E402
+from cleanrl_thesis import hwm_segment as hwm
 
 MEASURES = {
     "f1_4_rooms_0": "F1, 4 rooms, exact",
@@ -62,9 +60,9 @@ class Args:
     """folder for the table, the committees and the figure"""
 
 
-def read_args(run: Path) -> hwm.Args:
+def hwm_args(run: Path) -> hwm.Args:
     """The arguments of a run."""
-    args = hwm.Args(**json.loads((run / "args.json").read_text()))
+    args = hwm.Args(**read_args(run))
     args.max_grad_norm = float(args.max_grad_norm)  # JSON has no infinity
     args.demos, args.heldout_demos = Path(args.demos), args.heldout_demos and Path(args.heldout_demos)
     return args
@@ -72,14 +70,13 @@ def read_args(run: Path) -> hwm.Args:
 
 def kl_m(run: Path) -> float:
     """KL[q(m) ‖ p(m)] per step in training, the mean over the last fifth of it."""
-    with open(run / "updates.csv", newline="") as file:
-        values = [float(row["losses/kl_m"]) for row in csv.DictReader(file)]
+    values = [float(row["losses/kl_m"]) for row in read_csv(run / "updates.csv")]
     return float(np.mean(values[-max(1, len(values) // 5) :]))
 
 
 def segment(run: Path) -> tuple[list[np.ndarray], list[hwm.Episode]]:
     """What the model of a run finds in the held-out episodes, m from p (section 3.5.1), and these."""
-    args = read_args(run)
+    args = hwm_args(run)
     episodes, _ = hwm.read_split(args)
     parameters = safetensors.torch.load_file(run / "model.safetensors")
     num_actions = max(int(episode.actions.max()) for episode in episodes.training) + 1
@@ -121,7 +118,7 @@ def table(rows: list[dict]) -> list[str]:
     lines = [f"| boundaries | of | {' | '.join(titles)} |", "|" + "---|" * (len(titles) + 2)]
     for name in dict.fromkeys(row["boundaries"] for row in rows):
         group = [row for row in rows if row["boundaries"] == name]
-        cells = [interval([row[key] for row in group]) for key in MEASURES] + above_floors(group)
+        cells = [with_interval([row[key] for row in group]) for key in MEASURES] + above_floors(group)
         lines.append(f"| {name} | {len(group)} | {' | '.join(cells)} |")
     return [
         *lines,
@@ -146,6 +143,8 @@ def draw(rows: list[dict], path: Path) -> None:
 
 def main(args: Args) -> None:
     """Measure each model and each committee, and write table, rows and figure."""
+    if args.size > args.trained:
+        raise UsageError(f"--size {args.size}: must be at most --trained {args.trained}")
     runs = {
         result["seed"]: run
         for run, result in finished_runs(args.runs)
@@ -164,18 +163,21 @@ def main(args: Args) -> None:
         rows += [{**score("one model", [seed], parts[seed][0], episodes), "kl_m": kls[seed]} for seed in group]
         chosen = sorted(sorted(group, key=kls.get)[: args.size])
         agreed = [hwm.agree(np.stack(votes)) for votes in zip(*(parts[seed][0] for seed in chosen))]
-        whole = args.size == args.trained
-        name = f"most of {args.size} models" if whole else f"most of {args.size} models of {args.trained}"
+        name = f"most of {args.size} models" + ("" if args.size == args.trained else f" of {args.trained}")
         committees.append({**score(name, chosen, agreed, episodes), "kl_m": np.mean([kls[seed] for seed in chosen])})
     rows += committees
     results = [json.loads((runs[seed] / "result.json").read_text()) for group in groups for seed in group]
     scripts = sorted({commit_of("hwm_segment", result["script_sha256"]) for result in results})
     hours = sum(result["training_seconds"] for result in results) / 3600
-    text = [f"`benchmark/hwm_agreement.py` at {commit()}, runs of hwm_segment.py at {', '.join(scripts)}: ", ""]
+    flags = f"--rung {args.rung} --size {args.size} --trained {args.trained} --first-seed {args.first_seed}"
+    text = [
+        f"`python benchmark/hwm_agreement.py {flags}` at {commit()}, runs of hwm_segment.py at {', '.join(scripts)}: ",
+        "",
+    ]
     text[0] += f"{len(results)} runs {args.rung}, {hours:.1f} core-hours, one thread each."
     text += table(rows)
     args.out.mkdir(parents=True, exist_ok=True)
-    name = f"agreement_{args.rung}_{args.size}"
+    name = f"agreement_{args.rung}_{args.size}" + ("" if args.size == args.trained else f"_of_{args.trained}")
     (args.out / f"{name}.md").write_text("\n".join(text) + "\n")
     write_csv(args.out / f"{name}.csv", rows)
     draw(rows, args.out / f"{name}.png")

@@ -6,7 +6,6 @@
 Takes whatever part of the runs is done. Means over seeds, with 95% t-intervals where there are several.
 """
 
-import csv
 import json
 import math
 import re
@@ -17,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import ROOT, UsageError, commit, commit_of, finished_runs, run_main, write_csv
-from scipy import stats
+from common import ROOT, UsageError, commit, commit_of, finished_runs, read_csv, run_main, write_csv
+from intervals import with_interval
 
 RUNGS = {
     "faithful": "(a) Eq. 3.3.1 to 3.3.7",
@@ -88,8 +87,7 @@ def read_runs(folder: Path) -> list[dict]:
 def read_known(folder: Path, rows: list[dict]) -> list[dict]:
     """The rows of an earlier report whose runs are not among `rows`. Raises UsageError where there is none to read."""
     try:
-        with open(folder / "runs.csv", newline="") as file:
-            known = list(csv.DictReader(file))
+        known = read_csv(folder / "runs.csv")
     except OSError as error:
         raise UsageError(f"--known {folder}: runs.csv cannot be read: {error.strerror}") from None
     runs, words = {row["run"] for row in rows}, {"rung", "run", "script_sha256", "m"}
@@ -110,17 +108,6 @@ def mean_of_measured(rows: list[dict], key: str) -> str:
 def best_floors(rows: list[dict], measures: Iterable[str]) -> list[str]:
     """The mean of each measure's best floor, over the rows that have it."""
     return [mean_of_measured(rows, f"best_floor_{key}") for key in measures]
-
-
-def interval(values: list[float]) -> str:
-    """Mean and the half-width of its 95% t-interval; nothing where one was not measured (nan)."""
-    mean = float(np.mean(values))
-    if math.isnan(mean):
-        return ""
-    if len(values) < 2:
-        return f"{mean:.2f}"
-    half = stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / len(values) ** 0.5
-    return f"{mean:.2f} ± {half:.2f}"
 
 
 def above_floors(rows: list[dict]) -> list[str]:
@@ -146,7 +133,7 @@ def rung_table(rows: list[dict]) -> list[str]:
             group = groups[rung, mode]
             if not group:
                 continue
-            cells = [interval([row[key] for row in group]) for key in MEASURES if key != "reconstruction_mse"]
+            cells = [with_interval([row[key] for row in group]) for key in MEASURES if key != "reconstruction_mse"]
             cells.append(mean_of_measured(group, "reconstruction_mse"))
             minutes = np.mean([row["training_seconds"] for row in group]) / 60
             cells += [*above_floors(group), f"{minutes:.1f}"]

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The hierarchical world model alone: episodes of PPO, then for each rung of the ladder against collapse a model for each seed;
-# the runs behind benchmark/results/hwm_segment/. Can be sent again after every stop.
+# the runs behind benchmark/results/hwm_segment/. After an interruption, run the same command again.
 #   benchmark/hwm_segment.sh
 #   SEEDS="1" RUNGS="faithful narrow" benchmark/hwm_segment.sh
 #   WORKERS=40 SLURM=benchmark/slurm_template.sh benchmark/hwm_segment.sh     on a cluster; again for the report
@@ -8,7 +8,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3 4 5} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/hwm_segment}
 RUNGS=${RUNGS:-narrow surprise faithful literal reset kl_w price no_budget wander} PLAYER=${PLAYER:-runs/fourrooms/11_seed1_early}
-. benchmark/sweep_lines.sh  # sweep
+. benchmark/sweep_lines.sh  # sweep, end_unless_done
 # rung (a): Eq. 3.3.1 to 3.3.7; (b), (c) and (d) change one thing of it
 FAITHFUL="--no-w-reset --no-narrow-w --decoder-sees-h --decoder-sees-c --no-detach-kl-z --budget-price 0 --boundary-bound 0 --read-bias 0"
 FAITHFUL+=" --stoch-w 16 --kl-m-scale 1 --max-segments 10"
@@ -52,6 +52,6 @@ mkdir -p "$RUNS"
 record demos --save-demos 2300
 case " $RUNGS " in *" wander "*) record demos_noise_0.8 --save-demos 500 --demo-noise 0.8 ;; esac
 sweep models cleanrl_thesis/hwm_segment.py --save-model <<<"$lines" || code=$?
-[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
+end_unless_done
 "$PYTHON" benchmark/hwm_report.py --runs "$RUNS" ${KNOWN:+--known "$KNOWN"}
 exit "$code"

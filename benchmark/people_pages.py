@@ -5,6 +5,7 @@
 Needs Debian's chromium, `pip install playwright`, and a quiet machine for the times.
 """
 
+import contextlib
 import json
 import re
 import shutil
@@ -13,12 +14,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from common import ROOT, commit
 from playwright.sync_api import Page, sync_playwright
 
-ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "benchmark" / "results" / "people"
 GAMES = {
     "AppleGame-v0": ["ArrowUp", "ArrowLeft", "ArrowDown", "ArrowRight"],
@@ -28,11 +30,15 @@ GAMES = {
 SECONDS, ROUNDS = 12, 3  # of play for the times, each in a round of its own
 
 
-def start(script: str, *flags: str) -> tuple[subprocess.Popen, str]:
-    """A server and its address."""
+@contextlib.contextmanager
+def server(script: str, *flags: str) -> Iterator[str]:
+    """The address of a server, which ends with the block."""
     line = [sys.executable, str(ROOT / "cleanrl_thesis" / script), "--port", "0", *flags]
     process = subprocess.Popen(line, stdout=subprocess.PIPE, text=True)
-    return process, re.search(r"http://\S+", process.stdout.readline())[0]
+    try:
+        yield re.search(r"http://\S+", process.stdout.readline())[0]
+    finally:
+        process.terminate()
 
 
 def tap_keys(page: Page, keys: list[str], seconds: float) -> None:
@@ -48,24 +54,23 @@ def tap_keys(page: Page, keys: list[str], seconds: float) -> None:
 
 def picture_recorder(browser, env_id: str) -> dict:
     """A picture of a round of practice; quantiles of the time from key to picture, in ms."""
-    process, address = start("record_human.py", "--env-id", env_id, "--practice", "--seed", "1")
     page, latencies, median = browser.new_page(viewport={"width": 1000, "height": 700}), [], []
-    page.goto(address)
-    for _ in range(ROUNDS):
-        page.wait_for_selector("#practice:enabled")
-        page.click("#practice")
-        page.wait_for_selector("#veil", state="hidden", timeout=15_000)
-        known = len(page.evaluate("latencies"))
-        tap_keys(page, GAMES[env_id], SECONDS / 3)
-        page.screenshot(path=OUT / f"record_{env_id.split('/')[-1].split('-')[0].lower()}.png")
-        tap_keys(page, GAMES[env_id], 2 * SECONDS / 3)
-        new = page.evaluate("latencies")[known:]
-        latencies += new
-        median.append(round(statistics.median(new), 1))
-        if page.is_visible("#stop"):
-            page.click("#stop")
-    page.close()
-    process.terminate()
+    with server("record_human.py", "--env-id", env_id, "--practice", "--seed", "1") as address:
+        page.goto(address)
+        for _ in range(ROUNDS):
+            page.wait_for_selector("#practice:enabled")
+            page.click("#practice")
+            page.wait_for_selector("#veil", state="hidden", timeout=15_000)
+            known = len(page.evaluate("latencies"))
+            tap_keys(page, GAMES[env_id], SECONDS / 3)
+            page.screenshot(path=OUT / f"record_{env_id.split('/')[-1].split('-')[0].lower()}.png")
+            tap_keys(page, GAMES[env_id], 2 * SECONDS / 3)
+            new = page.evaluate("latencies")[known:]
+            latencies += new
+            median.append(round(statistics.median(new), 1))
+            if page.is_visible("#stop"):
+                page.click("#stop")
+        page.close()
     quantiles = np.quantile(latencies, (0.1, 0.5, 0.9)).round(1).tolist()
     return {"keys": len(latencies), "ms at 10, 50 and 90%": quantiles, "median of each round": median}
 
@@ -78,22 +83,21 @@ def picture_study(browser, folder: Path) -> None:
     cut = ["--prepare", f"human={folder / 'run' / 'demos_synthetic_human'}", "--clips", "2", "--seconds", "3"]
     script = str(ROOT / "cleanrl_thesis" / "sensitivity_test.py")
     subprocess.run([sys.executable, script, "--videos", str(folder / "clips"), *cut], check=True, capture_output=True)
-    process, address = start("sensitivity_test.py", "--videos", str(folder / "clips"), "--db", str(folder / "s.sqlite"))
     page = browser.new_page(viewport={"width": 700, "height": 620})
-    page.goto(address)
-    page.wait_for_selector("#consent:visible")
-    page.screenshot(path=OUT / "study_consent.png")
-    page.check("#agree")
-    page.click("#join")
-    page.click("#start")
-    page.click("#play")
-    page.wait_for_selector("#question:visible", timeout=30_000)
-    page.click("[data-verdict=human]")
-    page.fill("#why", "takes a moment before it turns to the new apple")
-    page.set_viewport_size({"width": 700, "height": 1060})
-    page.screenshot(path=OUT / "study_question.png")
-    page.close()
-    process.terminate()
+    with server("sensitivity_test.py", "--videos", str(folder / "clips"), "--db", str(folder / "s.sqlite")) as address:
+        page.goto(address)
+        page.wait_for_selector("#consent:visible")
+        page.screenshot(path=OUT / "study_consent.png")
+        page.check("#agree")
+        page.click("#join")
+        page.click("#start")
+        page.click("#play")
+        page.wait_for_selector("#question:visible", timeout=30_000)
+        page.click("[data-verdict=human]")
+        page.fill("#why", "takes a moment before it turns to the new apple")
+        page.set_viewport_size({"width": 700, "height": 1060})
+        page.screenshot(path=OUT / "study_question.png")
+        page.close()
 
 
 def main() -> int:
@@ -103,10 +107,7 @@ def main() -> int:
         times = {env_id: picture_recorder(browser, env_id) for env_id in GAMES}
         picture_study(browser, Path(folder))
         browser.close()
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True
-    ).stdout.strip()
-    about = {"command": "python benchmark/people_pages.py", "commit": commit}
+    about = {"command": "python benchmark/people_pages.py", "commit": commit()}
     (OUT / "latency.json").write_text(json.dumps({**about, **times}, indent=2) + "\n")
     print(json.dumps(times, indent=2))
     return 0

@@ -5,12 +5,11 @@
 Takes whatever part of the runs is done, and says which.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from common import UsageError, commit, commit_of, finished_runs, run_main, write_csv
+from common import UsageError, commit, commit_of, finished_runs, read_csv, run_main, write_csv
 from matplotlib.figure import Figure
 from scipy import stats
 
@@ -23,11 +22,6 @@ class Args:
     """folder of the runs' folders"""
     out: Path = BENCHMARK / "results" / "ppo_k10"
     """folder for tables and figures"""
-
-
-def read_csv(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def read_runs(folder: Path) -> list[dict]:

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The study of chapter 4: 11 tasks × K {4, 10, 20, 40, 80} × {plain, KLE-Stop and KLE-Rollback at five d_target} × 2 seeds,
-# 1,210 runs. Can be sent again after every stop; stages share their runs.
+# 1,210 runs. After an interruption, run the same command again; stages share their runs.
 #   benchmark/ppo_kle.sh                                                         all 1,210, 2,000,000 steps each
 #   STAGES="first targets seeds others" STOP_AT=500000 benchmark/ppo_kle.sh      351 of them, 108 with more seeds, 500,000 steps
 #   STAGES="K10 K80" benchmark/ppo_kle.sh                                        72 of these to 2,000,000 steps

@@ -8,10 +8,10 @@ import sys
 import gymnasium as gym
 import numpy as np
 import torch
-from sb3_timing import report, timed
 from stable_baselines3 import DDPG
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
+from timing import report, timed
 
 
 def main(steps: int) -> None:

@@ -7,9 +7,9 @@ import sys
 
 import gymnasium as gym
 import torch
-from sb3_timing import report, timed
 from stable_baselines3 import DQN
 from stable_baselines3.common.monitor import Monitor
+from timing import report, timed
 
 
 def main(frames: int) -> None:

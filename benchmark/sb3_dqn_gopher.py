@@ -8,10 +8,10 @@ import sys
 import ale_py
 import gymnasium as gym
 import torch
-from sb3_timing import report, timed
 from stable_baselines3 import DQN
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from timing import report, timed
 
 GAMES, FRAME_SKIP = 8, 4
 

@@ -7,10 +7,10 @@ import sys
 
 import gymnasium as gym
 import torch
-from sb3_timing import report, timed
 from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from timing import report, timed
 
 
 def main(env_id: str, update_epochs: int, iterations: int) -> None:

@@ -8,8 +8,8 @@ import sys
 import gymnasium as gym
 import torch
 from sb3_contrib import TRPO
-from sb3_timing import report, timed
 from stable_baselines3.common.monitor import Monitor
+from timing import report, timed
 
 
 def main(env_id: str, batches: int, seed: int = 1) -> None:

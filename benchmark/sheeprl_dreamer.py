@@ -15,10 +15,10 @@ import gymnasium as gym
 import hydra
 import torch
 from lightning.fabric import Fabric
-from sb3_timing import report
 from sheeprl.algos.dreamer_v2.agent import build_agent
 from sheeprl.algos.dreamer_v2.dreamer_v2 import train
 from sheeprl.utils.utils import dotdict
+from timing import report
 
 SECONDS, WARM_UP = 8.0, 4  # of gradient steps, and gradient steps before
 ACTIONS, SIDE = 3, 64
@@ -58,9 +58,8 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     cfg, fabric = make_config(), Fabric(accelerator="cpu", devices=1)
-    torch.distributions.Distribution.set_default_validate_args(
-        cfg.distribution.validate_args
-    )  # these two as its command
+    # as its command does
+    torch.distributions.Distribution.set_default_validate_args(cfg.distribution.validate_args)
     torch.set_float32_matmul_precision(cfg.float32_matmul_precision)
     space = gym.spaces.Dict({"rgb": gym.spaces.Box(0, 255, (3, SIDE, SIDE), "uint8")})
     world_model, *others = build_agent(fabric, [ACTIONS], False, cfg, space)

@@ -3,13 +3,13 @@
 #SBATCH --array={{array}}
 #SBATCH --ntasks=1
 #SBATCH --cpus-per-task=1
-#SBATCH --mem=2G
+#SBATCH --mem={{memory}}
 #SBATCH --time=04:00:00
 #SBATCH --requeue
 #SBATCH --open-mode=append
 #SBATCH --signal=B:USR1@120
 #SBATCH --output={{logs}}/slurm_%A_%a.log
-# A task of a sweep. Two minutes before its time is up Slurm sends USR1: the run writes a checkpoint and queues again, as it
+# A task of a sweep; a copy of this file may have other lines above, as --gres=gpu:1 for runs with --cuda. Two minutes before its time is up Slurm sends USR1: the run writes a checkpoint and queues again, as it
 # does where an earlier process still holds its folder. After a crash it queues again up to {{retries}} times; a user's
 # mistake (exit code 2) fails at once.
 lines=({{lines}})

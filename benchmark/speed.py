@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from common import ROOT, UsageError, run_main
+from common import ROOT, UsageError, commit, run_main
 
 PEER = "stable-baselines3"
 
@@ -68,7 +68,7 @@ def run_process(command: list[str], folder: str) -> tuple[str, float]:
     return out, usage.ru_maxrss / 1024
 
 
-def time_peer(*words: object, python: Path | str = sys.executable) -> dict[str, float]:
+def time_script(*words: object, python: Path | str = sys.executable) -> dict[str, float]:
     """Run a peer's script, which prints its figures as JSON."""
     script, *arguments = map(str, words)
     out, memory = run_process([str(python), str(ROOT / "benchmark" / script), *arguments], str(ROOT))
@@ -87,7 +87,7 @@ def time_ours(script: str, *flags: object) -> dict[str, float]:
 def ppo_contenders(work: Work) -> dict:
     flags = ["--env-id", work.env_id, "--update-epochs", work.update_epochs, "--total-timesteps", work.steps]
     return {
-        PEER: lambda: time_peer("sb3_ppo.py", work.env_id, work.update_epochs, work.steps // 2048),
+        PEER: lambda: time_script("sb3_ppo.py", work.env_id, work.update_epochs, work.steps // 2048),
         "plain": lambda: time_ours("ppo_continuous_kle.py", *flags),
         "--compile": lambda: time_ours("ppo_continuous_kle.py", *flags, "--compile"),
     }
@@ -96,7 +96,7 @@ def ppo_contenders(work: Work) -> dict:
 def dqn_contenders(work: Work) -> dict:
     flags = ["--total-timesteps", work.steps]
     return {
-        PEER: lambda: time_peer("sb3_dqn.py", work.steps),
+        PEER: lambda: time_script("sb3_dqn.py", work.steps),
         "plain": lambda: time_ours("dqn_apple.py", *flags),
         "--compile": lambda: time_ours("dqn_apple.py", *flags, "--compile"),
     }
@@ -107,7 +107,7 @@ def gopher_contenders(work: Work) -> dict:
     flags = ["--total-timesteps", work.steps, "--buffer-size", 20_000, "--learning-starts", 800]
     simple = [*flags, "--no-double", "--no-dueling"]
     return {
-        PEER: lambda: time_peer("sb3_dqn_gopher.py", work.steps),
+        PEER: lambda: time_script("sb3_dqn_gopher.py", work.steps),
         "plain": lambda: time_ours("dqn_gopher.py", *simple),
         "--bf16": lambda: time_ours("dqn_gopher.py", *simple, "--bf16"),
         "--bf16, double and dueling": lambda: time_ours("dqn_gopher.py", *flags, "--bf16"),
@@ -142,7 +142,10 @@ def ddpg_contenders(work: Work) -> dict:
     def contender(flags: list):
         return lambda: time_ours("ddpg_torcs_like.py", "--total-timesteps", work.steps, *flags)
 
-    return {PEER: lambda: time_peer("sb3_ddpg.py", work.steps // 4), **{name: contender(f) for name, f in ours.items()}}
+    return {
+        PEER: lambda: time_script("sb3_ddpg.py", work.steps // 4),
+        **{name: contender(f) for name, f in ours.items()},
+    }
 
 
 def trpo_contenders(work: Work, demos: Path) -> dict:
@@ -150,7 +153,7 @@ def trpo_contenders(work: Work, demos: Path) -> dict:
     flags = ["--env-id", work.env_id, "--num-envs", 1, "--num-steps", 2048, "--alpha", 1, "--demos-rl", demos]
     flags += ["--fisher-every", 1, "--g-steps", 1, "--bc-epochs", 0, "--total-timesteps", work.steps]
     return {
-        "sb3-contrib, TRPO": lambda: time_peer("sb3_trpo.py", work.env_id, work.steps // 2048),
+        "sb3-contrib, TRPO": lambda: time_script("sb3_trpo.py", work.env_id, work.steps // 2048),
         "gail_hybrid.py, GAIL": lambda: time_ours("gail_hybrid.py", *flags),
     }
 
@@ -193,14 +196,13 @@ def write_results(
     args: Args, name: str, flags: str, results: list[dict], more: dict | None = None, text: str | None = None
 ) -> None:
     """Write the figures as JSON and as a table; `flags` are those that this part of the measurement depends on."""
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
     line = f"python benchmark/speed.py {args.what}{flags} --rounds {args.rounds}"
-    about = {"command": line, "commit": commit, "python": platform.python_version(), "threads": 1}
+    about = {"command": line, "commit": commit(), "python": platform.python_version(), "threads": 1}
     args.out.mkdir(parents=True, exist_ok=True)
     figures = {**about, "cores": os.cpu_count(), **(more or {}), "results": results}
     (args.out / f"{name}.json").write_text(json.dumps(figures, indent=1) + "\n")
     what = "Gradient steps" if text else "Steps per second"
-    text = f"{what}, {args.rounds} rounds in turn, one thread each (`{line}`, commit {commit[:7]})\n\n{text or table(results)}"
+    text = f"{what}, {args.rounds} rounds in turn, one thread each (`{line}`, commit {about['commit']})\n\n{text or table(results)}"
     for key, speeds in (more or {}).items():
         median, low, high = (f"{value / 1e6:.2f}" for value in (statistics.median(speeds), min(speeds), max(speeds)))
         text += f"\n{key}: {median} million steps/s ({low} to {high})\n"
@@ -248,10 +250,10 @@ def time_gail(args: Args) -> None:
 def rooms_contenders(work: Work) -> dict:
     """Frames of the whole maze at each step: MiniGrid's own (19 × 19 cells), and ours one by one and side by side."""
     return {
-        "MiniGrid, RGBImgObsWrapper": lambda: time_peer("fourrooms_steps.py", "MiniGrid-FourRooms-v0", 1, 1_000),
-        "one game": lambda: time_peer("fourrooms_steps.py", work.env_id, 1, 5_000),
-        "64 games": lambda: time_peer("fourrooms_steps.py", work.env_id, 64, work.steps // 64),
-        "256 games": lambda: time_peer("fourrooms_steps.py", work.env_id, 256, work.steps // 256),
+        "MiniGrid, RGBImgObsWrapper": lambda: time_script("fourrooms_steps.py", "MiniGrid-FourRooms-v0", 1, 1_000),
+        "one game": lambda: time_script("fourrooms_steps.py", work.env_id, 1, 5_000),
+        "64 games": lambda: time_script("fourrooms_steps.py", work.env_id, 64, work.steps // 64),
+        "256 games": lambda: time_script("fourrooms_steps.py", work.env_id, 256, work.steps // 256),
     }
 
 
@@ -309,13 +311,13 @@ def time_dreamer(args: Args) -> None:
         parts: dict[str, list] = {}
 
         def contender(flags: str, script=script, size=size, parts=parts) -> dict:
-            figures = time_peer("dreamer_step.py", script, size, *flags.split())
+            figures = time_script("dreamer_step.py", script, size, *flags.split())
             parts.setdefault(flags or "plain", []).append(figures.pop("milliseconds"))
             return figures
 
         contenders = {flags or "plain": lambda flags=flags, run=contender: run(flags) for flags in forms}
         if args.sheeprl and size == "m":
-            contenders["sheeprl"] = lambda: time_peer("sheeprl_dreamer.py", python=args.sheeprl.absolute())
+            contenders["sheeprl"] = lambda: time_script("sheeprl_dreamer.py", python=args.sheeprl.absolute())
         results.append({**measure(Work(title, None, 1), contenders, args.rounds), "milliseconds": parts})
     write_results(args, "dreamer", " --sheeprl PYTHON" if args.sheeprl else "", results, text=dreamer_table(results))
 

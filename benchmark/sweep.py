@@ -67,6 +67,10 @@ class Args:
     """submit to Slurm by this template instead of running here"""
     slurm_chunk: int = 1_000
     """tasks in an array; Slurm's default limit is 1,001"""
+    slurm_memory: str = "2G"
+    """memory of a task, as Slurm writes it"""
+    queued_code: int = 0
+    """exit code where runs were submitted to Slurm; for scripts that go on once all are done"""
     only: int | None = None
     """run this line of the manifest alone, from 0 on; for the tasks of an array"""
 
@@ -90,8 +94,19 @@ class Run:
         return json.dumps({"name": self.name, "command": self.command})
 
     def setting(self) -> str:
-        """What runs that take about as long have in common: all of the name but environment and seed."""
-        return "__".join(self.name.split("__")[1:-1])
+        """What runs that take about as long have in common: the name without its seed, of a grid also without its environment."""
+        name = re.sub(r"_+seed\d+$", "", self.name)
+        return name.partition("__")[2] if "__seed" in self.name else name
+
+    def stop_at(self) -> int | None:
+        """The `--stop-at` of its own. Raises UsageError where that is no number."""
+        for word, following in zip(self.command, (*self.command[1:], "")):
+            flag, equals, value = word.partition("=")
+            if flag.replace("_", "-") == "--stop-at":
+                value = value if equals else following
+                require(value.isdigit(), f"{self.name}: {flag} {value}: must be a number of steps")
+                return int(value)
+        return None
 
 
 def parse_grid(entries: tuple[str, ...]) -> list[list[tuple[str, str]]]:
@@ -125,24 +140,35 @@ def slug(text: str) -> str:
 
 def make_runs(args: Args) -> list[Run]:
     """All runs, in the order in which they are started. Raises UsageError."""
-    require(
-        bool(shlex.split(args.command)),
-        "--command: give interpreter, script and the flags that all runs share, in quotes",
-    )
-    require(slug(args.name) == args.name, f"--name {args.name}: must be letters, digits and any of . = -")
+    command = "--command: give interpreter, script and the flags that all runs share, in quotes"
+    require(bool(words_of(args.command)), command)
+    named = bool(args.name) and slug(args.name) == args.name
+    require(named, f"--name {args.name}: must be letters, digits and any of . = - _, the last not at an end")
     for name, least in (("num_seeds", 1), ("start_seed", 0), ("workers", 1), ("retries", 0), ("slurm_chunk", 1)):
         value = getattr(args, name)
         require(value >= least, f"--{name.replace('_', '-')} {value}: must be at least {least}")
+    memory = re.fullmatch(r"[1-9]\d*[KMGT]?", args.slurm_memory) is not None
+    require(memory, f"--slurm-memory {args.slurm_memory}: must be a number, with K, M, G or T")
     require(args.stop_at is None or args.stop_at >= 1, f"--stop-at {args.stop_at}: must be at least 1")
     runs = grid_runs(args) if args.lines is None else line_runs(args)
     name, number = Counter(run.name for run in runs).most_common(1)[0]
     flags = "--env-ids, --grid, --variants" if args.lines is None else f"--lines {args.lines}"
     require(number == 1, f"{flags}: {number} runs would have the folder {name}")
+    for run in runs:
+        run.stop_at()
     return runs
 
 
+def words_of(command: str) -> list[str]:
+    """The words of `--command`. Raises UsageError where a shell would see none."""
+    try:
+        return shlex.split(command)
+    except ValueError as error:
+        raise UsageError(f"--command {command}: {error}") from None
+
+
 def make_run(args: Args, name: str, flags: list[str]) -> Run:
-    words = [*shlex.split(args.command), *flags]
+    words = [*words_of(args.command), *flags]
     return Run(name, (*words, "--run-dir", str(args.runs / name), "--resume"))
 
 
@@ -204,7 +230,7 @@ def check_begun(args: Args, runs: list[Run], manifests: dict[Path, list[Run]]) -
 def check_manifest(args: Args, runs: list[Run]) -> None:
     """Raise UsageError where runs were begun otherwise, or cannot begin."""
     require(args.runs.is_dir() or not args.runs.exists(), f"--runs {args.runs}: must be a folder")
-    for script in [word for word in shlex.split(args.command) if word.endswith(".py")][:1]:
+    for script in [word for word in words_of(args.command) if word.endswith(".py")][:1]:
         require(Path(script).is_file(), f"--command {args.command}: there is no {script}")
     path = manifest_path(args)
     manifests = {other: read_manifest(other) for other in sorted(args.runs.glob("*.jsonl"))}
@@ -245,8 +271,8 @@ def read_result(folder: Path) -> dict | None:
 
 def is_done(args: Args, run: Run, result: dict | None) -> bool:
     """Whether a run has come to the end of its schedule, or to its `--stop-at`."""
-    words = command_of(args, run)
-    stop_at = int(words[words.index("--stop-at") + 1]) if "--stop-at" in words else math.inf
+    stops = [run.stop_at(), args.stop_at, math.inf]
+    stop_at = next(stop for stop in stops if stop is not None)
     return result is not None and (result.get("complete", False) or result.get("global_step", 0) >= stop_at)
 
 
@@ -294,8 +320,8 @@ def count_done(sweep: Sweep, run: Run, result: dict) -> None:
 
 def command_of(args: Args, run: Run) -> list[str]:
     """The words that start a run; one that has a `--stop-at` of its own keeps it."""
-    words = ["--stop-at", str(args.stop_at)] if args.stop_at is not None and "--stop-at" not in run.command else []
-    return [*run.command, *words]
+    stops_here = args.stop_at is not None and run.stop_at() is None
+    return [*run.command, *(["--stop-at", str(args.stop_at)] if stops_here else [])]
 
 
 def log_path(args: Args, run: Run) -> Path:
@@ -479,7 +505,7 @@ def report_end(args: Args, sweep: Sweep, signals: Signals) -> int:
     for run, code in sweep.failed.items():
         print(f"failed: {run.name} (exit code {code}, {log_path(args, run)}):\n{log_end(args, run)}", file=sys.stderr)
     if sweep.stopped:
-        print(f"{sweep.stopped}; sent again, the sweep goes on", file=sys.stderr)
+        print(f"{sweep.stopped}; run the same command again to continue", file=sys.stderr)
     if signals.received:
         return 128 + signals.received[0]
     return 1 if sweep.failed or sweep.stopped else 0
@@ -534,7 +560,10 @@ def free_job_name(args: Args) -> str:
 
 
 def submit(args: Args, runs: list[Run], job_name: str) -> int:
-    """Submit what is not done as arrays of at most `--slurm-chunk` tasks, one after the other. Raises UsageError."""
+    """Submit what is not done as arrays of at most `--slurm-chunk` tasks, one after the other. Returns the exit code.
+
+    Raises UsageError.
+    """
     left = [i for i, run in enumerate(runs) if not is_done(args, run, read_result(args.runs / run.name))]
     template = args.slurm_template_path.read_text()
     for part in ("slurm", "logs"):
@@ -547,6 +576,7 @@ def submit(args: Args, runs: list[Run], job_name: str) -> int:
             "name": job_name,
             "array": f"0-{len(lines) - 1}%{args.workers}",
             "lines": " ".join(map(str, lines)),
+            "memory": args.slurm_memory,
             "logs": f"{args.runs.resolve()}/logs",
             "retries": str(args.retries),
             "command": shlex.join([*one, "--only"]),
@@ -558,7 +588,7 @@ def submit(args: Args, runs: list[Run], job_name: str) -> int:
         after = [f"--dependency=afterany:{job}"]  # so that --workers holds for all of them
     if not left:
         print(f"all {len(runs)} runs are done")
-    return 0
+    return args.queued_code if left else 0
 
 
 def main(args: Args) -> int:
@@ -581,7 +611,7 @@ def cli() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"error: {error}; sent again, the sweep goes on", file=sys.stderr)
+        print(f"error: {error}; run the same command again to continue", file=sys.stderr)
         return 1
 
 

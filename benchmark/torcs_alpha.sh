@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The driving task: DDPG experts (45 minutes each), the first of which the students learn from; hybrids over α (4 minutes
 # each), more seeds of those in Table 2.3, hybrids with one thing otherwise, and clones of the drivers' actions alone: the
-# runs behind benchmark/results/torcs/. Can be sent again after every stop. An expert takes 0.9 GB of disk.
+# runs behind benchmark/results/torcs/. After an interruption, run the same command again. An expert takes 0.9 GB of disk.
 #   benchmark/torcs_alpha.sh
 #   SEEDS="1" MORE_SEEDS="" ALPHAS="0.5" WORKERS=1 OUT=runs/first_look benchmark/torcs_alpha.sh
 #   WORKERS=50 SLURM=benchmark/slurm_template.sh benchmark/torcs_alpha.sh     on a cluster; again when the experts are done, and for the report
@@ -11,12 +11,12 @@ EXPERTS=${EXPERTS:-1 2} SEEDS=${SEEDS:-1 2 3} MORE_SEEDS=${MORE_SEEDS-4 5} WORKE
 OUT=${OUT:-benchmark/results/torcs}
 ALPHAS=${ALPHAS:-0.5 0.0 1.0 0.7 0.3 0.9 0.1 0.8 0.2 0.6 0.4}
 MIXED=${MIXED:-0.5 0.0 1.0}
-. benchmark/sweep_lines.sh  # sweep
+. benchmark/sweep_lines.sh  # sweep, end_unless_done
 mkdir -p "$RUNS"
 for seed in $EXPERTS; do
   echo "expert_seed$seed --seed $seed"
 done | sweep experts cleanrl_thesis/ddpg_torcs_like.py --compile --save-model --save-demos 220 || code=$?
-[ "$code" -le 1 ] || exit "$code"
+end_unless_done
 [ -e "$RUNS/expert_seed${EXPERTS%% *}/result.json" ] || { echo "the students wait for $RUNS/expert_seed${EXPERTS%% *}"; exit "$code"; }
 for seed in $SEEDS $MORE_SEEDS; do
   human="$RUNS/human_seed$seed"
@@ -43,6 +43,6 @@ student() {  # seed, α, name, more flags
     student "$seed" 0.5 fisher1_alpha0.5 --fisher-every 1
   done
 } | sweep students cleanrl_thesis/gail_hybrid.py --save-model --save-demos 20 --eval-episodes 100 || code=$?
-[ "$code" -le 1 ] || exit "$code"  # after failed runs, code 1, which are listed, the report is of the others
+end_unless_done
 "$PYTHON" benchmark/torcs_report.py --runs "$RUNS" --expert "${EXPERTS%% *}" --out "$OUT"
 exit "$code"

@@ -15,8 +15,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from apple_report import interval, representative_alpha, with_interval
-from common import ROOT, UsageError, commit, commit_of, published_table, run_main, write_csv
+from apple_report import representative_alpha
+from common import (
+    ROOT,
+    UsageError,
+    commit,
+    finished_runs,
+    kind_of,
+    made_at,
+    published_table,
+    read_args,
+    run_main,
+    select,
+    write_csv,
+)
+from intervals import interval, with_interval
 from matplotlib.figure import Figure
 
 from cleanrl_thesis import gail_hybrid as gail
@@ -43,15 +56,12 @@ class Args:
 def read_runs(folder: Path, expert: int) -> list[dict]:
     """A row for every finished run and way to act, and for all demonstrations; experts but one are of kind `other`."""
     rows = []
-    for path in sorted(folder.glob("*_seed*/result.json")):
-        result, args = json.loads(path.read_text()), json.loads((path.parent / "args.json").read_text())
-        if not result["complete"]:
-            continue
-        is_student = "greedy" in result["evaluation"]
+    for path, result in finished_runs(folder):
+        args, is_student = read_args(path), "greedy" in result["evaluation"]
         evaluations = result["evaluation"] if is_student else {"evaluation": result["evaluation"]}
         run = {"alpha": args.get("alpha", ""), "steps": result["global_step"]}
         run |= {"training_seconds": round(result["training_seconds"]), "script_sha256": result["script_sha256"][:12]}
-        rows += [run_row(path.parent, mode, numbers["driving"], run) for mode, numbers in evaluations.items()]
+        rows += [run_row(path, mode, numbers["driving"], run) for mode, numbers in evaluations.items()]
     for path in sorted(folder.glob("*_seed*/manifest.json")) + sorted(folder.glob("expert_seed*/demos/manifest.json")):
         run = path.parent.parent if path.parent.name == "demos" else path.parent
         if run == path.parent or is_complete(run):
@@ -72,9 +82,9 @@ def is_complete(folder: Path) -> bool:
 
 def run_row(folder: Path, mode: str, driving: dict, run: dict) -> dict:
     """What is kept of a run's scores; `run` is empty for demonstrations."""
-    kind, seed = folder.name.rsplit("_seed", 1)
+    name, seed = folder.name.rsplit("_seed", 1)
     return {
-        "kind": kind,
+        "kind": kind_of(folder) if run else name,
         "seed": int(seed),
         "alpha": run.get("alpha", ""),
         "mode": mode,
@@ -88,11 +98,6 @@ def run_row(folder: Path, mode: str, driving: dict, run: dict) -> dict:
         "training_seconds": run.get("training_seconds", 0),
         "script_sha256": run.get("script_sha256", ""),
     }
-
-
-def select(rows: list[dict], kind: str, mode: str) -> list[dict]:
-    """A row for each seed."""
-    return [row for row in rows if row["kind"] == kind and row["mode"] == mode]
 
 
 def mean_score(rows: list[dict], kind: str, mode: str = "demonstrations") -> float:
@@ -230,10 +235,11 @@ def figure_2_8(rows: list[dict]) -> Figure:
 # How they drive
 # ---------------------------------------------------------------------------------------------------------------------
 def read_episodes(folder: Path, most: int) -> list[dict[str, np.ndarray]]:
-    """The first demonstrations in a folder; none where there is none."""
-    episodes = []
-    for path in sorted(folder.glob("episode_*.npz"))[:most]:
-        with np.load(path, allow_pickle=False) as arrays:
+    """The first demonstrations that a folder's manifest names; none where there is no manifest, or not yet."""
+    path, episodes = folder / "manifest.json", []
+    names = sorted(json.loads(path.read_text())["files"]) if path.exists() else []
+    for name in names[:most]:
+        with np.load(folder / name, allow_pickle=False) as arrays:
             episodes.append(dict(arrays))
     return episodes
 
@@ -318,6 +324,7 @@ def drivers(folder: Path, expert: int, most: int) -> dict[str, list[list[dict[st
         if kind == "expert" and int(seed) != expert:
             continue
         if kind == "human" or is_complete(run):
+            kind = kind if kind == "human" else kind_of(run)
             episodes = read_episodes(run if kind == "human" else run / "demos", most)
             found.setdefault(EXPERTS.get(kind, kind), []).extend([episodes] if episodes else [])
     return {name: seeds for name, seeds in found.items() if seeds}
@@ -381,13 +388,9 @@ def provenance(rows: list[dict]) -> str:
     own = [row for row in rows if row["mode"] in ("greedy", "evaluation")]
     hours = sum(row["training_seconds"] for row in own) / 3600
     scripts = {"ddpg_torcs_like": ("expert", "other"), "gail_hybrid": ("alpha",)}
-    made_at = []
-    for script, parts in scripts.items():
-        digests = {row["script_sha256"] for row in own if any(part in row["kind"] for part in parts)}
-        made_at.append(f"{script}.py at {', '.join(sorted(commit_of(script, digest) for digest in digests))}")
     seeds = ", ".join(map(str, sorted({row["seed"] for row in own})))
     return (
-        f"`benchmark/torcs_alpha.sh`, commits: {'; '.join(made_at)}; this report at {commit()}. {len(own)} runs, "
+        f"`benchmark/torcs_alpha.sh`, commits: {made_at(own, scripts)}; this report at {commit()}. {len(own)} runs, "
         f"{hours:.1f} core-hours of training, seeds {seeds}; each ± is a 95% t-interval over seeds.\n\n"
     )
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import torch
-from common import ROOT, run_main
+from common import ROOT, commit, run_main
 from scipy import stats
 
 from cleanrl_thesis import gail_hybrid as gail
@@ -107,13 +107,14 @@ def main(args: Args) -> None:
     with ThreadPoolExecutor(args.workers) as pool:
         means = [float(np.mean(result["last_50_returns"])) for result in pool.map(run, commands)]
     contenders = {"gail_hybrid.py": means[::2], "sb3-contrib": means[1::2]}
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
     command = f"python benchmark/trpo_returns.py --env-id {args.env_id} --seeds {args.seeds} --batches {args.batches}"
-    about = {"command": command, "commit": commit, "python": platform.python_version(), "threads": 1}
+    about = {"command": command, "commit": commit(), "python": platform.python_version(), "threads": 1}
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "returns.json").write_text(json.dumps({**about, "mean_returns": contenders}, indent=1) + "\n")
     text = report(args, contenders)
-    (args.out / "returns.md").write_text(f"# TRPO beside sb3-contrib's\n\n{text}\n`{command}`, commit {commit[:7]}.\n")
+    (args.out / "returns.md").write_text(
+        f"# TRPO beside sb3-contrib's\n\n{text}\n`{command}`, commit {about['commit']}.\n"
+    )
     print(text)
 
 
