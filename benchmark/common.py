@@ -63,6 +63,20 @@ def read_csv(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def read_known(path: Path, words: set[str]) -> list[dict]:
+    """The rows of an earlier report; all columns but `words` hold numbers or nothing. Raises UsageError where it cannot be read."""
+    try:
+        rows = read_csv(path)
+    except OSError as error:
+        raise UsageError(f"--known {path.parent}: {path.name} cannot be read: {error.strerror}") from None
+    return [{key: value if key in words else number(value) for key, value in row.items()} for row in rows]
+
+
+def number(text: str) -> int | float | str:
+    """What a cell holds that is a number or empty."""
+    return int(text) if text.isdigit() else float(text) if text else ""
+
+
 def published_rows(name: str) -> list[dict[str, str]]:
     """A published table."""
     return read_csv(ROOT / "benchmark" / "published" / name)

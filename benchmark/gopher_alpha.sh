@@ -1,28 +1,33 @@
 #!/usr/bin/env bash
-# Gopher: a teacher from 10,010,000 frames of pixels, and students of it and of the synthetic human over α, and over T at
-# two α, with controls; the runs behind benchmark/results/gopher/. After an interruption, run the same command again. The teacher takes about 3
-# hours of a core with bfloat16, 4 without (benchmark/results/speed/gopher.md), 7 of two cores without AVX-512; its replay 8 GB.
+# Gopher: DQNs from pixels, and students of the second and of the synthetic human over α, and over T at two α, with controls; the runs
+# behind benchmark/results/gopher/. After an interruption, run the same command again. The thesis' 10,010,000 frames take about 3
+# hours of a core with bfloat16, 4 without (benchmark/results/speed/gopher.md), 7 of two cores without AVX-512, and 8 GB for the
+# replay; the students' teacher has the frames after which a DQN plays as well as the thesis' (40.3 rewards of a life).
 #   benchmark/gopher_alpha.sh
-#   SEEDS="1" WORKERS=1 benchmark/gopher_alpha.sh
-#   THREADS=2 benchmark/gopher_alpha.sh     the teacher with both cores, where nothing else runs
+#   SEEDS="1" WORKERS=1 FULL= benchmark/gopher_alpha.sh     without the DQN of all frames, of which nothing learns
+#   THREADS=2 benchmark/gopher_alpha.sh     DQNs with both cores, where nothing else runs
 #   WORKERS=50 SLURM=benchmark/slurm_template.sh benchmark/gopher_alpha.sh     students on a cluster; again for the report
-#   ALPHAS=0.0 TEMPERATURES= CONTROL_SEEDS= TEACHER= benchmark/gopher_alpha.sh     the human's clones alone, which need no teacher
+#   ALPHAS=0.0 TEMPERATURES= CONTROL_SEEDS= FULL= TEACHER= benchmark/gopher_alpha.sh     the human's clones alone, which need no DQN
+#   KNOWN=benchmark/results/gopher benchmark/gopher_alpha.sh     the reports go on from earlier ones whose run folders are gone
 set -euo pipefail
 cd "$(dirname "$0")/.."
 SEEDS=${SEEDS:-1 2 3} WORKERS=${WORKERS:-2} PYTHON=${PYTHON:-.venv/bin/python} RUNS=${RUNS:-runs/gopher}
-OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1} TEACHER=${TEACHER-$RUNS/teacher_seed1}
+OUT=${OUT:-benchmark/results/gopher} THREADS=${THREADS:-1} FULL=${FULL-$RUNS/full_seed1}
+TEACHER=${TEACHER-$RUNS/teacher_seed1} TEACHER_FRAMES=${TEACHER_FRAMES:-4000000}
 ALPHAS=${ALPHAS:-0.8 1.0 0.0 0.5 0.6 0.7 0.9 0.3 0.4 0.2 0.1}
 TEMPERATURES=${TEMPERATURES-0.1 0} OTHER_ALPHAS=${OTHER_ALPHAS:-0.8 1.0}
 CONTROL_SEEDS=${CONTROL_SEEDS-${SEEDS%% *}}
 SLURM_MEMORY=${SLURM_MEMORY:-6G}  # a student holds 1.6 GB of frames, for a moment twice
 . benchmark/sweep_lines.sh  # sweep, end_unless_done
 mkdir -p "$RUNS"
-if [ -n "$TEACHER" ]; then
+dqn() {  # folder, frames
   # lives end episodes as in Baselines; targets of three steps stand for its prioritised replay; the rate falls, for the last network
   # is the teacher. Two threads only on an otherwise idle machine: waiting threads spin, and competing processes slow the run down.
-  "$PYTHON" cleanrl_thesis/dqn_gopher.py --life-loss-ends --n-step 3 --anneal-lr --bf16 \
-    --num-threads "$THREADS" --save-model --eval-episodes 400 --run-dir "$TEACHER" --resume
-fi
+  "$PYTHON" cleanrl_thesis/dqn_gopher.py --total-timesteps "$2" --life-loss-ends --n-step 3 --anneal-lr --bf16 \
+    --num-threads "$THREADS" --save-model --eval-episodes 400 --run-dir "$1" --resume
+}
+[ -z "$TEACHER" ] || dqn "$TEACHER" "$TEACHER_FRAMES"
+[ -z "$FULL" ] || dqn "$FULL" 10010000
 for seed in $CONTROL_SEEDS; do  # a human who reacts to what the student sees too
   demos="$RUNS/quick_demos_seed$seed"
   [ -e "$demos/manifest.json" ] || "$PYTHON" benchmark/gopher_players.py --seed "$seed" --demos "$demos"
@@ -49,6 +54,6 @@ student() {  # seed, α, name, more flags
   done
 } | sweep students cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --compile --save-model || code=$?
 end_unless_done
-"$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT" ${NOTE:+--note "$NOTE"}
-"$PYTHON" benchmark/gopher_likeness.py --runs "$RUNS" --out "$OUT"
+"$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT" ${KNOWN:+--known "$KNOWN"} ${NOTE:+--note "$NOTE"}
+"$PYTHON" benchmark/gopher_likeness.py --runs "$RUNS" --out "$OUT" ${KNOWN:+--known "$KNOWN"}
 exit "$code"

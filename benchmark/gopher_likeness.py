@@ -1,6 +1,7 @@
 """How human Gopher's agents look, without people: how surely each is told from the synthetic human, and what participants named.
 
     python benchmark/gopher_likeness.py        # runs/gopher -> benchmark/results/gopher/likeness.md, .csv
+    python benchmark/gopher_likeness.py --known benchmark/results/gopher   # with the agents of an earlier report, whose folders are gone
 
 Section 2.4.2 quotes people on the DQN: "systematically fills the holes with great precision", a reaction time, "unnatural lateral
 movement while filling the holes", "tries to needlessly fill regions without holes". Each agent plays as many games for each seed
@@ -9,6 +10,7 @@ train a classifier of 2 s of play, which is tried on the other half. Takes whate
 """
 
 import functools
+import json
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +19,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from apple_report import load_student, median, tell_apart
-from common import ROOT, UsageError, commit, finished_runs, run_folders, run_main, write_csv
+from common import ROOT, UsageError, commit, finished_runs, read_known, run_folders, run_main, write_csv
 from gopher_players import ENV_ID, load_method
+from gopher_report import DQNS
 from intervals import with_interval
 
 UP_FIRE = 5
@@ -43,6 +46,8 @@ class Args:
     """folder of the runs' folders"""
     games: int = 20
     """games of each agent and seed, half of them held out"""
+    known: Path | None = None
+    """folder of an earlier report, whose likeness.csv stands for agents that are not in `--runs`"""
     out: Path = ROOT / "benchmark" / "results" / "gopher"
     """folder for the results"""
 
@@ -63,10 +68,12 @@ def agents_of(method, folder: Path, seed: int, games: int) -> dict[str, list[dic
     cautious = functools.partial(
         method.epsilon_greedy_policy, num_actions=num_actions, epsilon=method.ATARI_EPSILON, seed=seed
     )
-    if (folder / "teacher_seed1" / "result.json").exists():
-        teacher = method.greedy_policy(method.load_teacher(folder / "teacher_seed1", ENV_ID), torch.device("cpu"))
-        played["DQN"] = method.play_atari(cautious(teacher), make_game, seeds)
     runs = run_folders(folder)
+    for (kind, _), run in runs.items():
+        if kind in DQNS:
+            dqn = method.greedy_policy(method.load_teacher(run, ENV_ID), torch.device("cpu"))
+            name = f"DQN of {json.loads((run / 'result.json').read_text())['global_step']:,} frames"
+            played[name] = method.play_atari(cautious(dqn), make_game, seeds)
     for alpha in ALPHAS:
         run = runs.get((f"alpha{alpha}", seed))
         if run is not None:
@@ -201,6 +208,12 @@ def measure(method, folder: Path, seeds: list[int], games: int) -> list[dict]:
     return rows
 
 
+def in_order(row: dict) -> tuple:
+    """Humans first, then the DQNs, then their students."""
+    agent = row["agent"]
+    return not agent.startswith(HUMAN), not agent.startswith("DQN"), agent, row["seed"]
+
+
 def table(rows: list[dict]) -> str:
     """Means over seeds with 95% t-intervals, as Markdown."""
     values = defaultdict(lambda: defaultdict(list))
@@ -224,6 +237,11 @@ def main(args: Args) -> None:
     if not seeds:
         raise UsageError(f"--runs {args.runs}: holds no finished student")
     rows = measure(load_method("distill_hybrid"), args.runs, seeds, args.games)
+    if args.known is not None:
+        have = {(row["agent"], row["seed"]) for row in rows}
+        known = read_known(args.known / "likeness.csv", {"agent"})
+        rows += [row for row in known if (row["agent"], row["seed"]) not in have]
+    rows.sort(key=in_order)
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(
         args.out / "likeness.csv",

@@ -1,6 +1,7 @@
-"""Gopher's runs -> Table 2.2, Fig. 2.6, the teacher's learning curve, and whether the thesis' claims hold.
+"""Gopher's runs -> Table 2.2, Fig. 2.6, the DQNs' learning curves, and whether the thesis' claims hold.
 
     python benchmark/gopher_report.py        # runs/gopher -> benchmark/results/gopher
+    python benchmark/gopher_report.py --known benchmark/results/gopher   # with the runs of an earlier report, whose folders are gone
 
 Takes whatever part of the runs of `benchmark/gopher_alpha.sh` is done. Scores are the number of rewards in each life, the unit in
 which Table 2.2 seems to count (benchmark/results/README.md), and in `runs.csv` also the points of a game. Intervals are 95%
@@ -17,11 +18,13 @@ from common import (
     ROOT,
     UsageError,
     commit,
+    distinct,
     finished_runs,
     kind_of,
     made_at,
     published_table,
     read_args,
+    read_known,
     run_main,
     select,
     write_csv,
@@ -33,9 +36,11 @@ from matplotlib.figure import Figure
 
 LIVES, GAMES = "rewards of a life", "points of a game"
 STUDENTS = {"hybrid, α = 0.8": "alpha0.8", "BC, α = 0": "alpha0.0", "distilled DQN, α = 1": "alpha1.0"}
+DQNS = {"full": "", "teacher": ", the students' teacher"}
+WORDS = {"kind", "mode", "unit", "arithmetic", "script_sha256", "flags"}  # columns of runs.csv without numbers
 CONTROLS = ("quick_", "episode_")  # how their folders' names begin
 PLATEAU = "mean of α = 0.1 to 0.6"
-WINDOW = 50  # episodes of the teacher's moving mean
+WINDOW = 50  # episodes of a DQN's moving mean
 
 
 @dataclass
@@ -44,6 +49,8 @@ class Args:
     """folder of the runs' folders"""
     human_episodes: int = 300
     """games of the synthetic human for each seed"""
+    known: Path | None = None
+    """folder of an earlier report, whose runs.csv stands for runs that are not in `--runs`"""
     note: str = ""
     """a sentence put above the tables, on what the runs do not record themselves"""
     out: Path = ROOT / "benchmark" / "results" / "gopher"
@@ -67,8 +74,15 @@ def read_runs(folder: Path) -> list[dict]:
                 row |= {"agrees_with_human": round(result.get("test", {}).get("accuracy_human", np.nan), 4)}
                 row |= {"steps": result["global_step"], "training_seconds": round(result["training_seconds"])}
                 row |= {"threads": args["num_threads"], "arithmetic": result["arithmetic"]}
+                row |= {"flags": "" if is_student else own_flags(args)}
                 rows.append(row | {"script_sha256": result["script_sha256"][:12]})
     return rows
+
+
+def own_flags(args: dict) -> str:
+    """In what a DQN differs from the defaults of dqn_gopher.py, which are the thesis', but for its frames."""
+    flags = [("--life-loss-ends", args["life_loss_ends"]), (f"--n-step {args['n_step']}", args["n_step"] > 1)]
+    return " ".join(flag for flag, holds in (*flags, ("--anneal-lr", args["anneal_lr"])) if holds)
 
 
 def human_rows(seeds: list[int], episodes: int, quick: bool = False) -> list[dict]:
@@ -94,7 +108,9 @@ def table_2_2(rows: list[dict], human: list[dict]) -> str:
     published = published_table("table_2_2.csv")
     header = "| agent | | seeds | max, mean over seeds | min, mean over seeds | avg | std | taken for a human, of 52 | points of a game |"
     lines = [header, "|" + "---|" * 9]
-    measured = {"human": [("synthetic", human)], "DQN": [("greedy", select(rows, "teacher", "greedy"))]}
+    measured = {"human": [("synthetic", human)]}
+    dqns = {kind: select(rows, kind, "greedy") for kind in DQNS}
+    measured |= {"DQN": [(f"{distinct(dqns[kind], 'steps')} frames{DQNS[kind]}", dqns[kind]) for kind in DQNS]}
     measured |= {name: [(mode, select(rows, kind, mode)) for mode in ACTS] for name, kind in STUDENTS.items()}
     for agent, groups in measured.items():
         if agent in published:
@@ -264,8 +280,8 @@ def figure_2_6(rows: list[dict], human: float) -> Figure:
     return figure
 
 
-def teacher_curve(run: Path) -> list[dict]:
-    """The moving mean of the teacher's episodes in training, at 200 points; empty where none has ended."""
+def dqn_curve(run: Path) -> list[dict]:
+    """The moving mean of a DQN's episodes in training, at 200 points; empty where none has ended."""
     lines = (run / "episodes.csv").read_text().splitlines()[1:]
     if not lines:
         return []
@@ -277,34 +293,34 @@ def teacher_curve(run: Path) -> list[dict]:
     return [{"frames": int(x), f"mean_of_{width}_episodes": round(float(y), 1)} for x, y in zip(at, values)]
 
 
-def teacher_flags(runs: Path) -> str:
-    """In what the teachers differ from the defaults of dqn_gopher.py, which are the thesis'."""
-    flags = set()
-    for run, _ in finished_runs(runs):
-        args = read_args(run)
-        if run.name.startswith("teacher"):
-            named = [("--life-loss-ends", args["life_loss_ends"]), (f"--n-step {args['n_step']}", args["n_step"] > 1)]
-            flags.add(" ".join(flag for flag, holds in (*named, ("--anneal-lr", args["anneal_lr"])) if holds))
-    return f"The DQN was trained with `{'`, `'.join(sorted(flags))}`, which is ours. " if flags - {""} else ""
+def teacher_flags(rows: list[dict]) -> str:
+    """In what the DQNs differ from the thesis'."""
+    flags = sorted({row["flags"] for row in rows if row["flags"]})
+    return f"The DQN was trained with `{'`, `'.join(flags)}`, which is ours. " if flags else ""
 
 
-def provenance(rows: list[dict], runs_folder: Path, note: str) -> str:
+def provenance(rows: list[dict], note: str) -> str:
     """What the results rest on."""
     runs = {(row["kind"], row["seed"]): row for row in rows}
     hours = sum(row["training_seconds"] * row["threads"] for row in runs.values()) / 3600
     arithmetic = " and ".join(sorted({row["arithmetic"].split(" on ")[0].split(", ")[-1] for row in runs.values()}))
-    scripts = {"dqn_gopher": ("teacher",), "distill_hybrid": ("alpha",)}
+    scripts = {"dqn_gopher": tuple(DQNS), "distill_hybrid": ("alpha",)}
     return (
         f"`benchmark/gopher_alpha.sh`, commits: {made_at(rows, scripts)}; this report at {commit()}. {len(runs)} runs, "
         f"{hours:.1f} core-hours of training, in {arithmetic}; each ± is a 95% t-interval over seeds. All students learn from "
         "the same DQN, another of which would be other; differences from it hold the error of its own score. "
-        f"{teacher_flags(runs_folder)}A student learns at T = 0.01 where no other is named, and is of the epoch with the best test "
+        f"{teacher_flags(rows)}A student learns at T = 0.01 where no other is named, and is of the epoch with the best test "
         f"accuracy; greedy players have 1% of random actions.{f' {note}' if note else ''}\n\n"
     )
 
 
 def main(args: Args) -> None:
     rows = read_runs(args.runs)
+    if args.known is not None:
+        have = {(row["kind"], row["seed"]) for row in rows}
+        known = read_known(args.known / "runs.csv", WORDS)
+        rows += [row for row in known if (row["kind"], row["seed"]) not in have]
+        rows.sort(key=lambda row: (row["kind"], row["seed"]))
     if not rows:
         raise UsageError(f"--runs {args.runs}: holds no finished run")
     lives = [row for row in rows if row["unit"] == LIVES]
@@ -322,14 +338,13 @@ def main(args: Args) -> None:
             sections["Controls"] = controls_table(rows, human_rows(quick_seeds, args.human_episodes, quick=True))
         figure_2_6(lives, human_score).savefig(args.out / "fig_2_6.png", dpi=130)
     for run, _ in finished_runs(args.runs):
-        if run.name.startswith("teacher"):
-            (args.out / "teacher.png").write_bytes((run / "learning_curve.png").read_bytes())
-            curve = teacher_curve(run)
+        kind = kind_of(run)
+        if kind in DQNS:
+            (args.out / f"{kind}.png").write_bytes((run / "learning_curve.png").read_bytes())
+            curve = dqn_curve(run)
             if curve:
-                write_csv(args.out / "teacher.csv", curve)
-    text = provenance(rows, args.runs, args.note) + "\n".join(
-        f"## {name}\n\n{table}" for name, table in sections.items()
-    )
+                write_csv(args.out / f"{kind}.csv", curve)
+    text = provenance(rows, args.note) + "\n".join(f"## {name}\n\n{table}" for name, table in sections.items())
     (args.out / "table.md").write_text(text)
     print(text)
 

@@ -593,6 +593,15 @@ def test_the_report_takes_whatever_is_done(pixel_teacher, student, tmp_path):
         assert ("| BC, α = 0 | sampled | 1 |" in (tmp_path / runs / "table.md").read_text()) == has
     for name in ("fig_2_6.png", "teacher.png", "runs.csv"):
         assert (tmp_path / "out" / name).stat().st_size > 100
+    for gone in ("alpha0.0_seed1", "teacher_seed1"):
+        shutil.rmtree(tmp_path / "runs" / gone)
+    flags = ["--runs", "runs", "--human-episodes", 1, "--out", "again", "--known"]
+    run(*flags, "out", cwd=tmp_path, script=script)
+    for name in ("runs.csv", "table.md"):
+        assert (tmp_path / "again" / name).read_text() == (tmp_path / "out" / name).read_text()
+    assert (
+        "--known nowhere: runs.csv cannot be read" in run(*flags, "nowhere", cwd=tmp_path, script=script, code=2).stderr
+    )
 
 
 def test_the_report_of_runs_from_the_memory(small, tmp_path):
@@ -633,10 +642,10 @@ def test_the_teacher_s_curve_is_the_moving_mean_of_its_episodes(tmp_path):
     sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
     report = importlib.import_module("gopher_report")
     (tmp_path / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n")
-    assert report.teacher_curve(tmp_path) == []
+    assert report.dqn_curve(tmp_path) == []
     rows = "".join(f"{100 * (i + 1)},{i % 2 * 10},5\n" for i in range(101))
     (tmp_path / "episodes.csv").write_text("global_step,episodic_return,episodic_length\n" + rows)
-    curve = report.teacher_curve(tmp_path)
+    curve = report.dqn_curve(tmp_path)
     assert len(curve) == 200 and (curve[0]["frames"], curve[-1]["frames"]) == (5_000, 10_100)
     assert {row["mean_of_50_episodes"] for row in curve} == {5.0}
 
@@ -674,9 +683,19 @@ def test_likeness_of_whatever_is_done(student, pixel_teacher, tmp_path):
     script = ROOT / "benchmark" / "gopher_likeness.py"
     run("--runs", "runs", "--games", 2, "--out", "out", cwd=tmp_path, script=script)
     text = (tmp_path / "out" / "likeness.md").read_text()
-    agents = ["synthetic human", "synthetic human again", "DQN", "α = 0.8, sampled", "α = 0.8, greedy"]
+    frames = json.loads((pixel_teacher / "result.json").read_text())["global_step"]
+    agents = [
+        "synthetic human",
+        "synthetic human again",
+        f"DQN of {frames:,} frames",
+        "α = 0.8, greedy",
+        "α = 0.8, sampled",
+    ]
     assert [line.split(" | ")[0][2:] for line in text.splitlines()[4:]] == agents and "nan" not in text
     assert "holds no finished student" in run("--runs", "out", cwd=tmp_path, script=script, code=2).stderr
+    shutil.rmtree(tmp_path / "runs" / "teacher_seed1")
+    run("--runs", "runs", "--games", 2, "--out", "again", "--known", "out", cwd=tmp_path, script=script)
+    assert (tmp_path / "again" / "likeness.csv").read_text() == (tmp_path / "out" / "likeness.csv").read_text()
 
 
 def memory_after(actions: list[int]) -> np.ndarray:

@@ -441,9 +441,9 @@ def study(script: str, folder: Path, stand_in: str = STAND_IN, **settings: str) 
     [
         ("apple_alpha.sh", {"SEEDS": "1 2"}, 2 * (1 + 12 + 7 + 1 + 12 + 3 + 2 + 4 * 7), "apple_report.py"),
         ("torcs_alpha.sh", {}, 2 + 3 * (3 + 11 + 4) + 2 * 3, "torcs_report.py"),
-        ("gopher_alpha.sh", {"SEEDS": "1 2"}, 1 + 2 * (11 + 4) + 4, "gopher_likeness.py"),
+        ("gopher_alpha.sh", {"SEEDS": "1 2"}, 2 + 2 * (11 + 4) + 4, "gopher_likeness.py"),
         (
-            *("gopher_alpha.sh", {"ALPHAS": "0.0", "TEMPERATURES": "", "CONTROL_SEEDS": "", "TEACHER": ""}),
+            *("gopher_alpha.sh", {"ALPHAS": "0.0", "TEMPERATURES": "", "CONTROL_SEEDS": "", "FULL": "", "TEACHER": ""}),
             *(3, "gopher_likeness.py"),
         ),
         ("gopher_ram.sh", {}, 3, "gopher_ram.py"),
