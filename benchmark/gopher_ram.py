@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from common import ROOT, UsageError, commit, commit_of, distinct, finished_runs, read_csv, run_main, write_csv
-from gopher_report import WINDOW, teacher_curve
+from gopher_report import WINDOW, dqn_curve
 from intervals import with_interval
 from matplotlib.figure import Figure
 
@@ -67,7 +67,7 @@ def curves(runs: list[Path], random: float) -> Figure:
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     for run in runs:
-        points = [list(point.values()) for point in teacher_curve(run)]
+        points = [list(point.values()) for point in dqn_curve(run)]
         axes.plot(*np.transpose(points), label=run.name.replace("seed", "seed "))
     axes.axhline(random, color="black", linestyle=":", linewidth=1, label="random play")
     axes.axhline(5 * random, color="black", linestyle="--", linewidth=1, label="five times random play")

@@ -293,7 +293,7 @@ def dqn_curve(run: Path) -> list[dict]:
     return [{"frames": int(x), f"mean_of_{width}_episodes": round(float(y), 1)} for x, y in zip(at, values)]
 
 
-def teacher_flags(rows: list[dict]) -> str:
+def dqn_flags(rows: list[dict]) -> str:
     """In what the DQNs differ from the thesis'."""
     flags = sorted({row["flags"] for row in rows if row["flags"]})
     return f"The DQN was trained with `{'`, `'.join(flags)}`, which is ours. " if flags else ""
@@ -309,7 +309,7 @@ def provenance(rows: list[dict], note: str) -> str:
         f"`benchmark/gopher_alpha.sh`, commits: {made_at(rows, scripts)}; this report at {commit()}. {len(runs)} runs, "
         f"{hours:.1f} core-hours of training, in {arithmetic}; each ± is a 95% t-interval over seeds. All students learn from "
         "the same DQN, another of which would be other; differences from it hold the error of its own score. "
-        f"{teacher_flags(rows)}A student learns at T = 0.01 where no other is named, and is of the epoch with the best test "
+        f"{dqn_flags(rows)}A student learns at T = 0.01 where no other is named, and is of the epoch with the best test "
         f"accuracy; greedy players have 1% of random actions.{f' {note}' if note else ''}\n\n"
     )
 
