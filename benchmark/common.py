@@ -63,13 +63,18 @@ def read_csv(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def read_known(path: Path, words: set[str]) -> list[dict]:
-    """The rows of an earlier report; all columns but `words` hold numbers or nothing. Raises UsageError where it cannot be read."""
+def with_known(rows: list[dict], path: Path, run: tuple[str, ...], words: set[str]) -> list[dict]:
+    """`rows`, and those of an earlier report that are of other runs, which the columns `run` tell apart.
+
+    All columns of `path` but `words` hold numbers or nothing. Raises UsageError where it cannot be read.
+    """
     try:
-        rows = read_csv(path)
+        known = read_csv(path)
     except OSError as error:
         raise UsageError(f"--known {path.parent}: {path.name} cannot be read: {error.strerror}") from None
-    return [{key: value if key in words else number(value) for key, value in row.items()} for row in rows]
+    known = [{key: value if key in words else number(value) for key, value in row.items()} for row in known]
+    have = {tuple(row[name] for name in run) for row in rows}
+    return rows + [row for row in known if tuple(row[name] for name in run) not in have]
 
 
 def number(text: str) -> int | float | str:

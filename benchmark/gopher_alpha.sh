@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Gopher: DQNs from pixels, and students of the second and of the synthetic human over α, and over T at two α, with controls; the runs
-# behind benchmark/results/gopher/. After an interruption, run the same command again. The thesis' 10,010,000 frames take about 3
-# hours of a core with bfloat16, 4 without (benchmark/results/speed/gopher.md), 7 of two cores without AVX-512, and 8 GB for the
-# replay; the students' teacher has the frames after which a DQN plays as well as the thesis' (40.3 rewards of a life).
+# Gopher: a teacher from pixels, students of it and of the synthetic human over α, and over T at two α, with controls, and a DQN of
+# all the thesis' frames; the runs behind benchmark/results/gopher/. After an interruption, run the same command again. 10,010,000
+# frames take about 3 hours of a core with bfloat16, 4 without (benchmark/results/speed/gopher.md), 7 of two cores without AVX-512,
+# and 8 GB for the replay. The teacher has 4,000,000, where the other's games in training had 3,300 points, 0.61 of its last score.
 #   benchmark/gopher_alpha.sh
 #   SEEDS="1" WORKERS=1 FULL= benchmark/gopher_alpha.sh     without the DQN of all frames, of which nothing learns
 #   THREADS=2 benchmark/gopher_alpha.sh     DQNs with both cores, where nothing else runs
@@ -27,7 +27,6 @@ dqn() {  # folder, frames
     --num-threads "$THREADS" --save-model --eval-episodes 400 --run-dir "$1" --resume
 }
 [ -z "$TEACHER" ] || dqn "$TEACHER" "$TEACHER_FRAMES"
-[ -z "$FULL" ] || dqn "$FULL" 10010000
 for seed in $CONTROL_SEEDS; do  # a human who reacts to what the student sees too
   demos="$RUNS/quick_demos_seed$seed"
   [ -e "$demos/manifest.json" ] || "$PYTHON" benchmark/gopher_players.py --seed "$seed" --demos "$demos"
@@ -54,6 +53,7 @@ student() {  # seed, α, name, more flags
   done
 } | sweep students cleanrl_thesis/distill_hybrid.py --env-id ALE/Gopher-v5 --bf16 --compile --save-model || code=$?
 end_unless_done
+[ -z "$FULL" ] || dqn "$FULL" 10010000
 "$PYTHON" benchmark/gopher_report.py --runs "$RUNS" --out "$OUT" ${KNOWN:+--known "$KNOWN"} ${NOTE:+--note "$NOTE"}
 "$PYTHON" benchmark/gopher_likeness.py --runs "$RUNS" --out "$OUT" ${KNOWN:+--known "$KNOWN"}
 exit "$code"

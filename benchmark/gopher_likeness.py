@@ -19,7 +19,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from apple_report import load_student, median, tell_apart
-from common import ROOT, UsageError, commit, finished_runs, read_known, run_folders, run_main, write_csv
+from common import ROOT, UsageError, commit, finished_runs, run_folders, run_main, with_known, write_csv
 from gopher_players import ENV_ID, load_method
 from gopher_report import DQNS
 from intervals import with_interval
@@ -238,9 +238,7 @@ def main(args: Args) -> None:
         raise UsageError(f"--runs {args.runs}: holds no finished student")
     rows = measure(load_method("distill_hybrid"), args.runs, seeds, args.games)
     if args.known is not None:
-        have = {(row["agent"], row["seed"]) for row in rows}
-        known = read_known(args.known / "likeness.csv", {"agent"})
-        rows += [row for row in known if (row["agent"], row["seed"]) not in have]
+        rows = with_known(rows, args.known / "likeness.csv", ("agent", "seed"), {"agent"})
     rows.sort(key=in_order)
     args.out.mkdir(parents=True, exist_ok=True)
     write_csv(

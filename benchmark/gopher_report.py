@@ -24,9 +24,9 @@ from common import (
     made_at,
     published_table,
     read_args,
-    read_known,
     run_main,
     select,
+    with_known,
     write_csv,
 )
 from gopher_players import Args as PlayersArgs
@@ -317,9 +317,7 @@ def provenance(rows: list[dict], note: str) -> str:
 def main(args: Args) -> None:
     rows = read_runs(args.runs)
     if args.known is not None:
-        have = {(row["kind"], row["seed"]) for row in rows}
-        known = read_known(args.known / "runs.csv", WORDS)
-        rows += [row for row in known if (row["kind"], row["seed"]) not in have]
+        rows = with_known(rows, args.known / "runs.csv", ("kind", "seed"), WORDS)
         rows.sort(key=lambda row: (row["kind"], row["seed"]))
     if not rows:
         raise UsageError(f"--runs {args.runs}: holds no finished run")
