@@ -673,6 +673,7 @@ def test_habits_of_a_player_who_is_known():
 
 def test_likeness_of_whatever_is_done(student, pixel_teacher, tmp_path):
     """Memory is what the human saw; the table has each agent."""
+    sys.path.insert(0, str(ROOT / "benchmark"))  # where the scripts find one another
     likeness = importlib.import_module("gopher_likeness")
     make_game = functools.partial(distill.make_atari, "ALE/Gopher-v5", obs_type="ram", frame_stack=1)
     human, saw = distill.SyntheticGopherHuman(1, 0), []
