@@ -536,6 +536,22 @@ def test_ends_time_outs_returns_and_noise_of_a_rollout():
     assert np.allclose(agent.obs_mean, collector.obs_stats.mean)
 
 
+class BothEnds(Counter):
+    """Ends after 4 steps, by a fall at the time-out."""
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        return obs, reward, terminated or truncated, terminated or truncated, info
+
+
+def test_a_fall_at_the_time_out_is_a_fall():
+    args = make_args(num_steps=16, total_timesteps=160)
+    collector = ppo.Collector([BothEnds()], args)
+    collector.start()
+    rollout = collector.collect(make_agent(args, 1, 1))
+    assert rollout.dones.sum() == 4 and rollout.time_outs == []
+
+
 def test_evaluation_and_demonstrations_play_in_the_mode_that_is_asked_for(tmp_path):
     """Greedy the mean of normalised observations, sampled with the policy's deviation around it; both within bounds."""
     agent = make_agent(make_args(init_gains=(1.0, 1.0, 1.0)), 3, 1)

@@ -349,6 +349,20 @@ def test_the_best_policy_is_kept(monkeypatch):
     assert np.allclose(update.norm(obs), (obs - scales[1][0].numpy()) / scales[1][1].numpy())
 
 
+def test_the_best_policy_is_found_by_play_that_holds_its_actions(monkeypatch):
+    args, _, optimizer, update, _ = make(frame_skip=2)
+    best, acts = ddpg.Best(optimizer, update.norm), []
+
+    def play(policy, games, seeds):
+        acts.extend(policy(np.full((len(seeds), OBS), t, np.float32)) for t in range(3))
+        return [{"rewards": np.zeros(3)}]
+
+    monkeypatch.setattr(ddpg, "make_games", lambda args, number: None)
+    monkeypatch.setattr(ddpg, "play", play)
+    best.consider(args, gym.spaces.Box(-1, 1, (ACTIONS,)), 10)
+    assert np.array_equal(acts[0], acts[1]) and not np.array_equal(acts[1], acts[2])
+
+
 def test_returns_of_the_cars_are_those_of_their_episodes():
     players = ddpg.CarPlayers(ddpg.TorcsLikeVectorEnv(3), 5)
     players.start()

@@ -321,6 +321,14 @@ def test_an_episode_forgets_the_one_before_and_nothing_of_its_own():
     assert torch.equal(after[3, 0], plain[3, 0]) and not torch.equal(after[3, 1], plain[3, 1])
 
 
+def test_what_is_drawn_trains_the_posterior(tmp_path):
+    """Through the codes: without the weight of the KL divergence, which has a gradient of its own."""
+    learner = make_learner(kl_scale=0.0, entropy_scale=0.0, reward_scale=0.0, discount_scale=0.0)
+    wake(learner.model)
+    method.world_model_loss(learner.model, make_collector(tmp_path, learner).replay.sample(CPU), 0)[0].backward()
+    assert learner.model.posterior_out.weight.grad.abs().max() > 1e-6
+
+
 @pytest.mark.parametrize("tanh", [False, True])
 def test_loss_is_the_sum_of_its_parts(tmp_path, tanh):
     learner = make_learner(kl_balance=0.5, reward_scale=3.0, tanh_reward=tanh)
@@ -349,6 +357,9 @@ def test_loss_is_the_sum_of_its_parts(tmp_path, tanh):
     assert loss.item() == pytest.approx(total.item(), rel=1e-4)
     assert parts["losses/image"].item() == pytest.approx(image.item() / 18, rel=1e-4)
     assert parts["losses/reward"].item() == pytest.approx(reward.item() / 18, rel=1e-4)
+    inside = data.first == 0  # a first frame has no past to be foretold from
+    of_steps = method.kl_categorical(made.posterior, made.prior)[inside]
+    assert parts["losses/kl"].item() == pytest.approx(of_steps.mean().item(), rel=1e-4)
 
 
 def test_frames_are_normalised():
@@ -486,7 +497,8 @@ def test_losses_of_actor_and_critic():
     features, actions = torch.randn(4, 3, 5), F.one_hot(torch.randint(2, (3, 3)), 2).float()
     rewards, discounts = torch.randn(3, 3), 0.3 + 0.6 * torch.rand(3, 3)
     losses, _ = method.behaviour_loss(behaviour, method.Dream(features, actions, rewards, discounts), 0.8, 0.1)
-    slow, actor, critic = behaviour.slow_value(features), 0.0, 0.0
+    slow, actor, critic = behaviour.slow_critic(features).squeeze(-1), 0.0, 0.0
+    assert not torch.allclose(slow, behaviour.value(features))
     for n in range(3):
         weight = 1.0
         for h in range(3):
@@ -559,6 +571,14 @@ def test_every_flag_changes_an_update(flags):
     data = make_data([[1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [1, 0, 0, 0, 0, 0]])
     default, changed = (after_an_update(make_learner(**changes), data) for changes in ({}, flags))
     assert not torch.equal(default, changed)
+
+
+def test_the_slow_critic_is_copied_at_its_interval():
+    calls, learner = [], method.Learner(make_args(slow_interval=3), Chain(), CPU)
+    learner.behaviour.copy_critics = lambda: calls.append(learner.updates)
+    for _ in range(7):
+        learner.learn_behaviour(chain_starts())
+    assert calls == [3, 6]
 
 
 def test_dreams_start_at_states_that_do_not_end_an_episode():
@@ -1039,6 +1059,7 @@ class Shortest:
     """Reads a game's state from its frame and goes a shortest path."""
 
     greedy: list[bool] = []
+    begun: list[np.ndarray] = []
 
     def __init__(self, learner, num_games: int):
         maze = method.maze(11)
@@ -1049,6 +1070,7 @@ class Shortest:
 
     def observe(self, frames: np.ndarray, begins: np.ndarray) -> None:
         self.states = [self.state_of[frame.tobytes()] for frame in frames]
+        self.begun.append(begins.copy())
 
     def act(self, greedy: bool = False) -> np.ndarray:
         self.greedy.append(greedy)
@@ -1058,10 +1080,27 @@ class Shortest:
 def test_a_player_of_shortest_ways_has_the_optimal_return(tmp_path, monkeypatch):
     learner, picture = make_learner(eval_episodes=50), np.zeros((2, 22, 22, 3), np.uint8)
     monkeypatch.setattr(method, "Player", Shortest)
+    monkeypatch.setattr(Shortest, "greedy", [])
     monkeypatch.setattr(method, "dream_frames", lambda *_: (picture, picture))
     monkeypatch.setattr(method, "compare_dream", lambda *_: {})
     evaluation = method.evaluate(learner, learner.args, tmp_path)
     assert evaluation["mean"] == pytest.approx(evaluation["optimal"]) and evaluation["solved"] == 1
+    assert set(Shortest.greedy) == {True} and evaluation["mode"] == "greedy"
+
+
+def test_a_dream_is_compared_with_sampled_play_of_the_same_games(monkeypatch):
+    learner, asked = make_learner(), []
+
+    def play(learner, args, seeds, greedy):
+        asked.append((seeds, greedy))
+        return {"returns": np.array([0.2, 0.4])}
+
+    monkeypatch.setattr(method, "play", play)
+    monkeypatch.setattr(method, "dreamed_returns", lambda learner, args, seeds: (asked.append(seeds), np.ones(2))[1])
+    found = method.compare_dream(learner, learner.args, 2)
+    assert found == {"eval/real_return": pytest.approx(0.3), "eval/dreamed_return": 1}
+    seeds = [method.episode_seed(1, method.EVALUATION_STREAM, i) for i in range(2)]
+    assert asked == [(seeds, False), seeds]
 
 
 @pytest.mark.parametrize("greedy", [True, False])
@@ -1069,6 +1108,7 @@ def test_returns_of_an_evaluation_are_those_of_each_first_episode(greedy, monkey
     """Games that have ended go on until the last one has; what they earn then does not count."""
     monkeypatch.setattr(method, "Player", Shortest)
     monkeypatch.setattr(Shortest, "greedy", [])
+    monkeypatch.setattr(Shortest, "begun", [])
     learner = make_learner()
     played = method.play(learner, learner.args, list(range(30)), greedy)
     poses, goals = 4 * played["starts"][:, 0] + played["starts"][:, 1], played["starts"][:, 2]
@@ -1076,6 +1116,10 @@ def test_returns_of_an_evaluation_are_those_of_each_first_episode(greedy, monkey
     assert np.allclose(played["returns"], 1 - 0.9 * steps / 100) and played["solved"].all()
     assert len(played["actions"]) == steps[0] == len(played["states"]) - 1
     assert steps.max() > 2 * steps.min() and set(Shortest.greedy) == {greedy}
+    begun = np.array(Shortest.begun)  # what is believed is kept within an episode, and forgotten behind its end
+    assert begun[0].all() and len(begun) == steps.max()
+    for game, end in enumerate(steps):
+        assert not begun[1:end, game].any() and (end == steps.max() or begun[end, game])
 
 
 @pytest.mark.parametrize("tanh", [True, False])
@@ -1085,14 +1129,14 @@ def test_dreamed_returns_are_undiscounted_over_an_episodes_length(tanh, monkeypa
     rewards, goes_on = torch.tensor([[0.1, 0.2], [0.3, 0.4]]), torch.tensor([[0.5, 1.0], [0.0, 1.0]])
 
     def imagine(model, behaviour, state, horizon, gamma):
-        asked.append((len(state.features()), horizon, gamma))
+        asked.append((state.stoch.sum(-1).tolist(), horizon, gamma))
         return method.Dream(torch.zeros(3, 2, 1), torch.zeros(2, 2, 3), rewards, goes_on)
 
     monkeypatch.setattr(method, "imagine", imagine)
     paid = rewards.atanh() if tanh else rewards
     expected = [paid[0, 0] + 0.5 * paid[1, 0], paid[0, 1] + paid[1, 1]]
     assert np.allclose(method.dreamed_returns(learner, learner.args, [1, 2]), expected, atol=1e-5)
-    assert asked == [(2, 100, 1.0)]
+    assert asked == [([3, 3], 100, 1.0)]  # one class of each code: the first frame has been seen
 
 
 # The report

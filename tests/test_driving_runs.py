@@ -188,6 +188,26 @@ def test_demonstrations_can_be_played_again(kind, request):
             assert step[1] == reward
         assert np.array_equal(obs, observations) and (step[2] or step[3])
         assert times[50] == pytest.approx(1e9)
+        skip = {"expert": 5, "student": 2}[kind]  # each action is held for so many steps
+        blocks = actions[: len(actions) // skip * skip].reshape(-1, skip, 2)
+        assert (blocks == blocks[:, :1]).all() and (blocks[1:, 0] != blocks[:-1, 0]).any()
+
+
+def test_a_student_is_evaluated_as_it_drives(tmp_path, monkeypatch):
+    """Each action is held for `--frame-skip` steps, in both modes."""
+    torch.manual_seed(0)
+    agent, acts = gail.Agent(65, 2, 16), []
+
+    def play(policy, games, seeds, keep=False):
+        acts.append([policy(np.full((len(seeds), 65), t, np.float32)) for t in range(3)])
+        return [{"rewards": np.zeros(300), "terminated": np.array(False)}]
+
+    monkeypatch.setattr(gail, "play", play)
+    monkeypatch.setattr(gail, "measured", lambda episodes, args: {})
+    gail.evaluate(agent, gail.Args(env_id="TorcsLike-v0", frame_skip=2, alpha=0.0, eval_episodes=1), tmp_path)
+    assert len(acts) == 2
+    for first, held, other in acts:
+        assert np.array_equal(first, held) and not np.array_equal(held, other)
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,22 @@ def test_no_step_is_taken_where_none_helps():
     assert torch.equal(policy.vector, old) and metrics["losses/kl"] == 0
 
 
+def test_entropy_is_a_gain():
+    """The surrogate is that of torch.distributions, and more by the weighed entropy; a step raises every deviation for it."""
+    _, policy, batch = make_batch()
+    old = policy.vector.clone()
+    with torch.no_grad():
+        mean, logstd = policy(old, batch.obs)
+        pi, weight = torch.distributions.Normal(mean, logstd.exp()), torch.rand(256)
+        logprobs = pi.log_prob(batch.actions).sum(1)
+        expected = (weight * batch.advantages).mean() + 0.1 * pi.entropy()[0].sum()
+        found = gail.surrogate(policy, old, batch, logprobs - weight.log(), 0.1)
+    assert found.item() == pytest.approx(expected.item(), rel=1e-4)
+    still = batch._replace(advantages=torch.zeros(256))
+    gail.trpo_step(policy, still, 0.01, gail.Args(alpha=0.0, ent_coef=0.1))
+    assert (policy.vector[-ACTIONS:] > old[-ACTIONS:]).all()
+
+
 def test_gae_by_the_definition():
     """Sums of (γλ)^l δ, over every episode; behind a time-out the value goes on, behind an end it does not."""
     rng = np.random.default_rng(0)

@@ -723,6 +723,27 @@ def test_the_memory_is_where_the_synthetic_human_looks():
     assert place - distill.SHOVEL in distill.HOLES[dug.any(0)]
 
 
+def test_the_synthetic_human_sees_late_but_knows_where_its_hands_are():
+    human, saw = distill.SyntheticGopherHuman(1, 0), []
+    human.act = lambda farmer, earlier, late: saw.append((farmer, int(earlier[0]), int(late[0]))) or distill.NOOP
+    for t in range(12):
+        memory = np.zeros((1, 1, 128), np.uint8)
+        memory[..., 0], memory[..., distill.FARMER_X] = t, 100 + t
+        human(memory)
+    assert saw[4:] == [(100 + t, max(0, t - 5), t - 4) for t in range(4, 12)]  # 4 actions of 4 frames, 267 ms
+
+
+@pytest.mark.slow
+def test_the_synthetic_human_scores_as_the_published_one():
+    """23.87 rewards of a life in Table 2.2."""
+    make_game = functools.partial(distill.make_atari, "ALE/Gopher-v5", obs_type="ram", frame_stack=1)
+    lives = []
+    for i in range(40):
+        (episode,) = distill.play_atari(distill.SyntheticGopherHuman(1, i), make_game, [i])
+        lives += distill.rewards_per_life(episode)
+    assert abs(np.mean(lives) - 23.87) < 3 * np.std(lives) / len(lives) ** 0.5 < 6, np.mean(lives)
+
+
 def test_the_synthetic_human_presses_and_lets_go():
     make_game = functools.partial(distill.make_atari, "ALE/Gopher-v5", obs_type="ram", frame_stack=1)
     first, again = (distill.play_atari(distill.SyntheticGopherHuman(1, 0), make_game, [7])[0] for _ in range(2))

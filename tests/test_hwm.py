@@ -189,6 +189,18 @@ def test_loss_is_the_sum_of_its_terms():
     assert loss.item() == pytest.approx(total.item(), rel=1e-5)
 
 
+def test_the_prior_of_a_narrow_w():
+    """Its mean lies in ±1, its σ between 0.2 + 0.3 · 0.1 and 0.2 + 0.3 · 2.1."""
+    model, data = make_model(narrow_w=True), make_data([[9]])
+    torch.manual_seed(4)
+    made = model.infer(data, "train")
+    torch.manual_seed(4)
+    _, terms = method.hwm_loss(model, data, 1.0, 1.0)
+    normal, (mean, std) = torch.distributions.Normal, model.prior_w(made.belief.h)
+    kl = torch.distributions.kl_divergence(normal(*made.q_w), normal(mean.tanh(), 0.2 + 0.3 * std)).sum(-1)
+    assert terms["kl_w"].item() == pytest.approx(kl.mean().item(), rel=1e-4)
+
+
 def test_kl_z_prices_the_reads_unless_it_is_detached():
     """The loss is the same; q(m) has the gradient of its reads weighed by KL_z (Eq. 3.3.7), or none of it."""
     data, losses, slopes = make_data([[9], [9]]), [], []
@@ -218,7 +230,11 @@ def test_prices_of_reads():
         torch.manual_seed(4)
         loss, terms = method.hwm_loss(model, data, 1.0, 0.25)
         losses.append(loss.item())
-    rate = terms["read_rate"].item()
+    torch.manual_seed(4)
+    made = model.infer(data, "train")
+    free = 1 - made.forced  # of the steps that q(m) decided
+    rate = ((made.reads * free).sum() / free.sum()).item()
+    assert terms["read_rate"].item() == pytest.approx(rate)
     assert rate > 0.25 and losses[1] - losses[0] == pytest.approx(10 * (rate - 0.25) + 3 * rate, rel=1e-3)
 
 
@@ -454,12 +470,15 @@ def test_segments_are_no_more_than_asked_in_training_only():
     assert model.infer(data, "posterior").reads[:, 0].tolist() == [1] * 11
 
 
-def test_z_of_the_prior_needs_no_frame_after_the_first():
-    """Section 3.5.1: only w sees the frames; with actions and boundaries as before, c at the second read is what w made it."""
-    model, data = make_model(), make_data([[8]])
-    made = model.infer(data, "prior")
-    for t in range(1, 8):
-        expected = model.prior_z(made.belief.c[t]).mean if made.reads[t, 0] else made.belief.v[t - 1]
+@pytest.mark.parametrize("mode", ["prior", "sampled"])
+def test_z_of_the_prior_needs_no_frame_after_the_first(mode):
+    """Section 3.5.1: w is q's, z at an episode's first step too; later z is p's where it is read, else as before."""
+    model, data = make_model(read_bias=0.0), make_data([[4, 8]])
+    made = model.infer(data, mode)
+    assert torch.equal(made.belief.y, made.q_w.mean) and 2 < made.reads.sum() < 12
+    for t in range(12):
+        read = model.prior_z(made.belief.c[t]).mean if t not in (0, 4) else made.q_z.mean[t]
+        expected = read if made.reads[t, 0] else made.belief.v[t - 1]
         assert torch.allclose(made.belief.v[t], expected, atol=1e-6)
 
 
@@ -642,6 +661,42 @@ def test_clusters_and_probes_find_what_is_there():
     assert method.linear_probe((x[:200], labels[:200]), (x[200:], labels[200:])) > 0.99
     noise = rng.normal(size=(400, 4))
     assert method.linear_probe((noise[:200], labels[:200]), (noise[200:], labels[200:])) < 0.45
+
+
+def labelled(steps: int = 200) -> method.Episode:
+    """An episode whose cells, directions, goals and rooms are drawn one by one."""
+    rng = np.random.default_rng(0)
+    frames = np.zeros((steps, 2, 2, 3), np.float32)
+    return method.Episode(frames, np.zeros(steps, int), rng.integers(4, size=(steps, 3)), rng.integers(4, size=steps))
+
+
+def test_probes_read_each_label_from_each_level():
+    episode = labelled()
+    z, w = np.eye(4)[episode.states[:, 2]], np.eye(4)[episode.states[:, 1]]
+    seen = method.Segmented([], np.zeros(0), z, w, 0.0)
+    found = method.probes(seen, seen, [episode], [episode])
+    known = {(name, level) for name, parts in found.items() for level in "zw" if parts[level] > 0.99}
+    assert known == {("goal", "z"), ("direction", "w")}
+    assert max(parts[level] for name, parts in found.items() for level in "zw" if (name, level) not in known) < 0.6
+    few = episode.states[:, 2] < 2  # a probe knows the labels that it learned from
+    part = episode._replace(states=episode.states[few], rooms=episode.rooms[few])
+    learned = method.probes(seen._replace(z=z[few], w=w[few]), seen, [part], [episode])
+    assert learned["goal"]["z"] == pytest.approx(few.mean(), abs=0.01)
+    most = [np.bincount(column).max() / 200 for column in (episode.rooms, *episode.states.T)]
+    assert [parts["most frequent"] for parts in found.values()] == pytest.approx(most)
+
+
+@pytest.mark.parametrize("level", ["z", "w"])
+def test_mutual_information_is_that_of_z_and_the_room(level, monkeypatch):
+    episode, rng = labelled(), np.random.default_rng(1)
+    parts = {each: rng.normal(size=(200, 4)) for each in "zw"}
+    parts[level] = np.eye(4)[episode.rooms]
+    made = method.Segmented([rng.random(199) < 0.3], rng.normal(size=199), parts["z"], parts["w"], 0.0)
+    monkeypatch.setattr(method, "segment", lambda *_: made)
+    model = method.HWM(make_args(), np.zeros((2, 2, 3)), 3)
+    found = method.evaluate(model, method.Split([], [episode], [episode]), make_args(), torch.device("cpu"))
+    assert (found["prior"]["mutual_information_z_room"] > 0.7) == (level == "z")
+    assert found["prior"]["mutual_information_by_chance"] < 0.2
 
 
 def test_frames_are_shrunk_and_normalised_back():

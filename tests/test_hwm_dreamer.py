@@ -127,6 +127,53 @@ def test_the_dream_draws_m_with_its_probability_and_v_and_y_from_their_priors(cl
         assert torch.allclose(drawn.mean(0), mean, atol=0.03) and torch.allclose(drawn.std(0), std, atol=0.03)
 
 
+@pytest.mark.parametrize("script", ["hwm_dreamer", "hwm_hrl_dreamer"])
+def test_the_dream_takes_the_steps_of_the_inference(script):
+    """Where posteriors are the priors, and m is the same, a step without a frame is one with a frame."""
+    agent, sizes = importlib.import_module(f"cleanrl_thesis.{script}"), PARTS
+    torch.manual_seed(0)
+    model = agent.HWM(agent.complete_args(agent.Args(**{**TINY, "prefill": 500, "total_timesteps": 1000})), 3)
+    model.posterior_z.forward = lambda c, embed: model.prior_z(c)
+    model.posterior_w.forward = lambda hz, embed: model.prior_w(hz[:, : sizes[2]])
+    read = torch.tensor([[0.0], [1.0], [0.0], [1.0]])
+    model.draw_prior_m = lambda *_: read
+    state = agent.Belief(*(torch.randn(4, size) for size in sizes), torch.zeros(4, 1))
+    action, noise = one_hot(torch.tensor([0, 1, 2, 2])), model.noise(4)
+    dreamed = model.imagine_step(state, action, noise)
+    filtered, *_ = model.step(state, action, read, torch.zeros(4, 16), noise)
+    assert all(map(torch.allclose, dreamed, filtered)) and not torch.allclose(dreamed.h, state.h)
+
+
+@pytest.mark.parametrize("script", ["hwm_dreamer", "hwm_hrl_dreamer"])
+def test_play_and_dreams_draw_m_from_the_prior_that_is_trained(script):
+    """p(m_t | w_t, z_t, a_t), with the action that follows the belief."""
+    agent, data = importlib.import_module(f"cleanrl_thesis.{script}"), make_data([[1, 0, 0, 0, 0, 0]] * 3)
+    torch.manual_seed(0)
+    model = agent.HWM(agent.complete_args(agent.Args(**{**TINY, "prefill": 500, "total_timesteps": 1000})), 3)
+    embed = model.embedding(model.normalize(data.frames.flatten(0, 1))).unflatten(0, data.first.shape)
+    made = model.observe(embed, one_hot(data.actions), data.first, 1.0)
+    assert made.p_m.std() > 1e-3
+    for t in range(5):
+        state, p = agent.Belief(*(part[t] for part in made.belief)), torch.sigmoid(made.p_m[t])[:, None]
+        action = one_hot(data.actions[t + 1])
+        assert (
+            model.draw_prior_m(state, action, p - 1e-5).all() and not model.draw_prior_m(state, action, p + 1e-5).any()
+        )
+
+
+@pytest.mark.parametrize("script", ["hwm_dreamer", "hwm_hrl_dreamer"])
+def test_what_is_drawn_trains_the_posteriors(script):
+    """Through the codes: without the weights of the KL divergences, which have a gradient of their own."""
+    agent = importlib.import_module(f"cleanrl_thesis.{script}")
+    scales = dict.fromkeys(("kl_z", "kl_w", "kl_m", "entropy", "reward", "discount"), 0.0)
+    changes = {f"{name}_scale": value for name, value in scales.items()} | {"budget_price": 0.0}
+    torch.manual_seed(0)
+    model = agent.HWM(agent.complete_args(agent.Args(**TINY | changes, prefill=500, total_timesteps=1000)), 3)
+    agent.world_model_loss(model, make_data([[1, 0, 0, 0, 0, 0]] * 3), 0)[0].backward()
+    for posterior in (model.posterior_z, model.posterior_w):
+        assert posterior.outer.weight.grad.abs().max() > 1e-6
+
+
 def test_normal_draws_and_their_divergence():
     torch.manual_seed(0)
     q, p = (method.Normal(torch.randn(5, 3), torch.rand(5, 3) + 0.1) for _ in range(2))
@@ -397,6 +444,8 @@ def test_loss_is_the_sum_of_its_terms(classes, tanh):
     inside, free = 1 - data.first, 1 - made.forced[1:]  # steps with a past; and those that m decided
     kl_w = method.kl_divergence(made.q_w, model.prior_w(made.belief.h))
     assert parts["losses/kl_w"].item() == pytest.approx(((kl_w * inside).sum() / inside.sum()).item(), rel=1e-4)
+    kl_z, read = method.kl_divergence(made.q_z, model.prior_z(made.belief.c)), made.reads * inside
+    assert parts["losses/kl_z"].item() == pytest.approx(((kl_z * read).sum() / read.sum()).item(), rel=1e-4)
     agrees = ((made.p_m > 0) == (made.q_m[:-1] > 0)).float()
     assert parts["losses/agreement"].item() == pytest.approx(((agrees * free).sum() / free.sum()).item())
     settled = (1 - data.first[1:]) * (1 - data.first[:-1])  # steps that neither begin an episode nor come next
