@@ -60,7 +60,7 @@ def load_expert(run: Path):
     args = ddpg.Args(**json.loads((run / "args.json").read_text()))  # as written, with a text for the folder
     agent = ddpg.Agent(65, 2, args.hidden_size, args.layer_norm)
     agent.load_state_dict(safetensors.torch.load_file(run / "model.safetensors"))
-    norm = ddpg.RunningNorm(agent.obs_scale, args.normalize_obs)
+    norm = ddpg.RunningNorm(agent.obs_scale, args.norm_obs)
     policy = ddpg.make_policy(ddpg.FlatAdam(agent, args), norm, ddpg.TORCS_ACTIONS)
     return ddpg.held(policy, args.frame_skip)
 

@@ -152,7 +152,7 @@ class Args:
     """units in each of the two hidden layers (Baselines)"""
     layer_norm: bool = True
     """normalise the hidden layers (Baselines)"""
-    normalize_obs: bool = True
+    norm_obs: bool = True
     """bring observations to mean 0 and standard deviation 1 by running statistics, clipped to ±5 (Baselines)"""
     buffer_size: int = 1_000_000
     """transitions in the replay buffer, 536 bytes each with TorcsLike-v0 (section 2.4.3)"""
@@ -1925,7 +1925,7 @@ def main(args: Args) -> int:
     obs_dim, action_dim = env.observation_space.shape[0], env.action_space.shape[0]
     agent = Agent(obs_dim, action_dim, args.hidden_size, args.layer_norm).to(device)
     optimizer = FlatAdam(agent, args)
-    norm = RunningNorm(agent.obs_scale, args.normalize_obs)
+    norm = RunningNorm(agent.obs_scale, args.norm_obs)
     best = Best(optimizer, norm)
     players = make_players(args)
     rng = np.random.default_rng(np.random.SeedSequence(args.seed))

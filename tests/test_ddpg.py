@@ -23,7 +23,7 @@ def make(**flags):
     optimizer.target.add_(0.1 * torch.randn_like(optimizer.target))
     rows = torch.randn(32, 2 * OBS + ACTIONS + 2)
     rows[:, OBS + ACTIONS + 1] = 0.99 * (torch.rand(32) < 0.8)
-    norm = ddpg.RunningNorm(agent.obs_scale, args.normalize_obs)
+    norm = ddpg.RunningNorm(agent.obs_scale, args.norm_obs)
     norm.update(np.random.default_rng(0).normal(1, 2, (50, OBS)).astype(np.float32))
     return args, agent, optimizer, ddpg.Update(agent, optimizer, norm, args, rows), rows
 
@@ -70,7 +70,7 @@ def test_an_update_is_that_of_two_torch_optimisers(layer_norm):
 
 
 def test_observations_are_normalised_by_all_that_came():
-    """As numpy's mean and deviation, at least 0.1 of it, clipped to 5; restored; and left alone without --normalize-obs."""
+    """As numpy's mean and deviation, at least 0.1 of it, clipped to 5; restored; and left alone with --no-norm-obs."""
     obs = np.random.default_rng(0).normal(3, [2, 0.5, 0.01], (1_000, 3)).astype(np.float32)
     norm = ddpg.RunningNorm(torch.tensor([[0.0] * 3, [1.0] * 3]), True)
     for part in np.split(obs, 100):
