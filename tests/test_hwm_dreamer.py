@@ -130,14 +130,14 @@ def test_the_dream_draws_m_with_its_probability_and_v_and_y_from_their_priors(cl
 @pytest.mark.parametrize("script", ["hwm_dreamer", "hwm_hrl_dreamer"])
 def test_the_dream_takes_the_steps_of_the_inference(script):
     """Where posteriors are the priors, and m is the same, a step without a frame is one with a frame."""
-    agent, sizes = importlib.import_module(f"cleanrl_thesis.{script}"), PARTS
+    agent = importlib.import_module(f"cleanrl_thesis.{script}")
     torch.manual_seed(0)
     model = agent.HWM(agent.complete_args(agent.Args(**{**TINY, "prefill": 500, "total_timesteps": 1000})), 3)
     model.posterior_z.forward = lambda c, embed: model.prior_z(c)
-    model.posterior_w.forward = lambda hz, embed: model.prior_w(hz[:, : sizes[2]])
+    model.posterior_w.forward = lambda hz, embed: model.prior_w(hz[:, : PARTS[2]])
     read = torch.tensor([[0.0], [1.0], [0.0], [1.0]])
     model.draw_prior_m = lambda *_: read
-    state = agent.Belief(*(torch.randn(4, size) for size in sizes), torch.zeros(4, 1))
+    state = agent.Belief(*(torch.randn(4, size) for size in PARTS), torch.zeros(4, 1))
     action, noise = one_hot(torch.tensor([0, 1, 2, 2])), model.noise(4)
     dreamed = model.imagine_step(state, action, noise)
     filtered, *_ = model.step(state, action, read, torch.zeros(4, 16), noise)
@@ -156,9 +156,8 @@ def test_play_and_dreams_draw_m_from_the_prior_that_is_trained(script):
     for t in range(5):
         state, p = agent.Belief(*(part[t] for part in made.belief)), torch.sigmoid(made.p_m[t])[:, None]
         action = one_hot(data.actions[t + 1])
-        assert (
-            model.draw_prior_m(state, action, p - 1e-5).all() and not model.draw_prior_m(state, action, p + 1e-5).any()
-        )
+        assert model.draw_prior_m(state, action, p - 1e-5).all()
+        assert not model.draw_prior_m(state, action, p + 1e-5).any()
 
 
 @pytest.mark.parametrize("script", ["hwm_dreamer", "hwm_hrl_dreamer"])
